@@ -12,7 +12,7 @@ import runpy
 import sys
 
 from rcirl_jax.data import importing
-from rcirl_jax.data.store import order as pipeline
+from rcirl_jax.data.store import batches as pipeline
 
 SHARD_SCENES = 60
 BROKEN = "RCIRL_BROKEN_RESUME"

@@ -81,7 +81,7 @@ def main() -> None:
     form = _FORMAT.value or recognised_format(path, source)
     if _FORMAT.value is None and path is not None:
         print(f"--format={form}: recognised", flush=True)
-    parts = parts_of(form, path, source)
+    parts = input_files(form, path, source)
     config = _IMPORT(ImportConfig(format=form, collect=_RECIPE().collect))
     if _SIGNALS.value:
         read = leaving_out(parts) if config.leaves_out else parts

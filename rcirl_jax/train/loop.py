@@ -19,10 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rcirl_jax.data.store.batches import Prefetch, split_batches
 from rcirl_jax.data.store.joined import Demonstrations
-from rcirl_jax.data.store.order import split_batches
 from rcirl_jax.data.store.rows import check_finite
-from rcirl_jax.data.store.stream import Prefetch
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.reward import Normaliser, fit_normaliser, pinned

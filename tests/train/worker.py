@@ -9,7 +9,7 @@ from pathlib import Path
 
 import jax
 
-from rcirl_jax.data.store import order as pipeline
+from rcirl_jax.data.store import batches as pipeline
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.runtime.signals import Interrupted
 from rcirl_jax.sampling import SamplerConfig

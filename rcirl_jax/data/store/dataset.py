@@ -14,6 +14,7 @@ keys, no spaces, without that field). Nothing written depends on the time or the
 machine: equal scenes give equal bytes.
 """
 
+import abc
 import functools
 import json
 import os
@@ -25,7 +26,7 @@ import numpy as np
 import tensorstore as ts
 
 from rcirl_jax.data.store.files import FACTS, MANIFEST, SHARDS, Files, context
-from rcirl_jax.data.store.manifest import Manifest, check_count, parse_manifest
+from rcirl_jax.data.store.manifest import Manifest, parse_manifest
 from rcirl_jax.data.store.rows import leaf_specs, row_spec
 from rcirl_jax.data.store.shards import BLOCK_ROWS, layout, shard_key, verify_shard
 from rcirl_jax.data.store.splits import check_disjoint
@@ -36,7 +37,36 @@ from rcirl_jax.types import Demonstration
 OPEN_SHARDS = 256  # shards whose arrays are kept open, 60 kB each
 
 
-class Dataset:
+class Demonstrations(abc.ABC):
+    """Rows by number, in splits: a dataset, several joined, or one split anew."""
+
+    @property
+    @abc.abstractmethod
+    def hash(self) -> str:
+        """Identity of the whole contents."""
+
+    @abc.abstractmethod
+    def indices(self, split: str | None) -> np.ndarray:
+        """Return row numbers [m] int64 of a split (None: of all), ascending."""
+
+    @abc.abstractmethod
+    def blocks(self, indices: np.ndarray) -> np.ndarray:
+        """Return the number [m] of the block, unpacked together, of each row."""
+
+    @abc.abstractmethod
+    def read(self, indices: np.ndarray) -> Demonstration:
+        """Read rows by number, numpy leaves [m, ...], in the order asked for."""
+
+    def load(self, split: str | None) -> Demonstration:
+        """Read all rows of a split (None: of all splits) into memory."""
+        return self.read(self.indices(split))
+
+    def weights(self, indices: np.ndarray) -> np.ndarray:
+        """Return the weight [m] float32 of each scene in a training loss."""
+        return np.ones(np.size(indices), np.float32)
+
+
+class Dataset(Demonstrations):
     """A finished dataset, opened with `open_dataset`; rows are numbered 0 .. n-1.
 
     `dataset[row]` is one scene and what the human did in it; loops run over all rows.
@@ -57,7 +87,7 @@ class Dataset:
         self._open: dict[int, dict[str, ts.TensorStore]] = {}
 
     def __getitem__(self, row: int) -> Demonstration:
-        """One row; numpy leaves without the row's axis.
+        """Return one row; numpy leaves without the row's axis.
 
         Raises:
           IndexError: no such row.
@@ -75,7 +105,7 @@ class Dataset:
         return self.manifest.count
 
     def write_facts(self, body: Mapping[str, object]) -> None:
-        """Say beside the manifest what made the dataset: commit, versions, flags.
+        """Write beside the manifest what made the dataset: commit, versions, flags.
 
         Raises:
           OSError: the place cannot be written.
@@ -84,7 +114,7 @@ class Dataset:
         self._files.write_many({FACTS: text.encode()})
 
     def facts(self) -> dict[str, Any]:
-        """What `write_facts` wrote; empty where nobody did.
+        """Return what `write_facts` wrote; empty where nobody did.
 
         Raises:
           InputError: not a JSON object.
@@ -101,7 +131,7 @@ class Dataset:
         return found
 
     def _arrays(self, shard: int) -> dict[str, ts.TensorStore]:
-        """The shard's arrays, opened once, of the shapes and dtypes promised."""
+        """Return the shard's arrays, opened once, of the shapes and dtypes promised."""
         if shard in self._open:
             return self._open[shard]
         key, count = shard_key(shard), self.manifest.shards[shard]["count"]
@@ -116,29 +146,32 @@ class Dataset:
         }
         arrays = {}
         for name, leaf in leaf_specs().items():
-            array = self._files.wait(futures[name], key + name)
+            array = arrays[name] = self._files.wait(futures[name], key + name)
+            where = f"{self._files.path(key + name)}: shard {shard}"
             found = (array.dtype.numpy_dtype, array.shape)
             expected = (leaf.dtype, (count, *leaf.shape))
             if found != expected:
                 raise InputError(
-                    f"{self._files.path(key + name)}: shard {shard}: {found[0]} "
-                    f"{found[1]}: expected {expected[0]} {expected[1]}"
+                    f"{where}: {found[0]} {found[1]}: expected {expected[0]} "
+                    f"{expected[1]}"
                 )
             grid = array.chunk_layout
             chunks = (grid.read_chunk.shape, grid.write_chunk.shape)
-            if chunks != layout(array.shape):
+            if chunks != layout(array.shape):  # a huge block would fill the memory
                 raise InputError(
-                    f"{self._files.path(key + name)}: shard {shard}: chunks {chunks}: "
-                    f"expected {layout(array.shape)}"
+                    f"{where}: chunks {chunks}: expected {layout(array.shape)}"
                 )
-            arrays[name] = array
         if len(self._open) >= OPEN_SHARDS:
             self._open.pop(next(iter(self._open)))
         self._open[shard] = arrays
         return arrays
 
     def verify(self) -> None:
-        """Check every byte; InputError names the shard and the file at fault."""
+        """Check every byte.
+
+        Raises:
+          InputError: names the shard and the file at fault.
+        """
         for number, shard in enumerate(self.manifest.shards):
             verify_shard(self._files, number, shard["sha256"])
             self._arrays(number)
@@ -164,7 +197,7 @@ class Dataset:
         return {split: [number[name] for name in names] for split, names in splits}
 
     def indices(self, split: str | None) -> np.ndarray:
-        """[m] int64 row numbers of a split in ascending order; of all for None."""
+        """Return row numbers [m] int64 of a split (None: of all), ascending."""
         rows = np.arange(self.count)
         if split is None:
             return rows
@@ -177,30 +210,22 @@ class Dataset:
 
     @functools.cached_property
     def _groups(self) -> np.ndarray:
-        return self._read(np.arange(self.count), ("group",))["group"]
-
-    def weights(self, indices: np.ndarray) -> np.ndarray:
-        """[m] float32 weight of each scene in a training loss: 1 in a single source."""
-        return np.ones(np.size(indices), np.float32)
+        return self.column("group")
 
     def blocks(self, indices: np.ndarray) -> np.ndarray:
-        """[m] number of the block of rows, unpacked together, that each lies in."""
+        """Return the number [m] of the block, unpacked together, of each row."""
         shard = np.searchsorted(self._starts, indices, side="right") - 1
         counts = -(-np.diff(self._starts) // BLOCK_ROWS)
         before = np.cumsum([0, *counts])[shard]
         return before + (indices - self._starts[shard]) // BLOCK_ROWS
 
-    def load(self, split: str | None) -> Demonstration:
-        """All rows of a split (None: of all splits) in memory."""
-        return self.read(self.indices(split))
-
     def read(self, indices: np.ndarray) -> Demonstration:
-        """Rows by number, numpy leaves [m, ...], in the order asked for."""
+        """Read rows by number, numpy leaves [m, ...], in the order asked for."""
         leaves = self._read(indices, tuple(leaf_specs()))
         return jax.tree.unflatten(jax.tree.structure(row_spec()), leaves.values())
 
     def column(self, name: str) -> np.ndarray:
-        """One leaf of all rows, e.g. "scene.tags", numpy [n, ...]."""
+        """Read one leaf of all rows, e.g. "scene.tags", numpy [n, ...]."""
         return self._read(np.arange(self.count), (name,))[name]
 
     def _read(
@@ -254,5 +279,4 @@ def open_dataset(url: str | os.PathLike[str], verify: bool = True) -> Dataset:
     dataset = Dataset(files, parse_manifest(raw, files))
     if verify:
         dataset.verify()
-    check_count(dataset.manifest, files.path(MANIFEST))
     return dataset

@@ -2,15 +2,14 @@
 
 import contextlib
 import functools
-import hashlib
 import os
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import tensorstore as ts
 
-from rcirl_jax.data.store.rows import _T
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.pipeline import LOCK, only_one
 
@@ -18,6 +17,8 @@ MANIFEST, MARK, SHARDS = "manifest.json", "shard.json", "shards/"
 FACTS = "made_by.json"  # beside the manifest, whose bytes depend on the logs alone
 # of each; the manifest of 10 million scenes takes some 10 MiB
 JSON_BYTES = {MANIFEST: 2**30, MARK: 2**28, FACTS: 2**28}
+
+_T = TypeVar("_T")
 
 
 class Files:
@@ -38,7 +39,7 @@ class Files:
             ) from error
 
     def alone(self) -> contextlib.AbstractContextManager[None]:
-        """Held by this process; remote places cannot be.
+        """Hold the folder for this process; remote places cannot be held.
 
         Raises:
           InputError: another process holds the folder.
@@ -48,11 +49,11 @@ class Files:
         return only_one(Path(self.folder), leave_nothing=True)
 
     def path(self, key: str) -> str:
-        """How messages call a key."""
+        """Return how messages call a key."""
         return f"{self.name}/{key}"
 
     def wait(self, future: "ts.Future[_T]", key: str) -> _T:
-        """A read's result; a failure names the key."""
+        """Return a read's result; a failure names the key."""
         try:
             return future.result()
         except ValueError as error:
@@ -62,7 +63,7 @@ class Files:
             ) from error
 
     def list_keys(self) -> list[str]:
-        """All keys below the dataset, but for the lock of who writes it.
+        """Return all keys below the dataset, but for the lock of who writes it.
 
         Raises:
           InputError: one is no text.
@@ -76,84 +77,49 @@ class Files:
             ) from error
         return [key for key in found if key != LOCK]
 
-    def read_json(self, key: str) -> bytes | None:
-        """The bytes of one of the dataset's JSON files, or None.
-
-        Raises:
-          InputError: it cannot be read, or is too large (`JSON_BYTES`); in a folder
-            that is seen before it is read.
-        """
-        self._check_size(key, self._size(key))
-        value = self._value(self.kv.read(key), key)
-        self._check_size(key, None if value is None else len(value))
-        return value
-
-    def digests(
-        self, expected: Mapping[str, int]
-    ) -> Iterator[tuple[str, int, str | None]]:
-        """(key, bytes, sha256) of each value; (key, 0, None) where it is missing.
-
-        Files of a folder are read piece by piece, remote ones all at once.
+    def read(self, most: Mapping[str, int]) -> dict[str, bytes | None]:
+        """Read values, all at once; None where there is none.
 
         Args:
-          expected: key -> its bytes; a file of another number of bytes is not read, and
-            its sha256 is None.
+          most: key -> bytes that it may have; a longer file of a folder is not read.
 
         Raises:
-          InputError: one cannot be read.
+          InputError: one cannot be read, or is too large.
         """
-        futures = {} if self.folder else {key: self.kv.read(key) for key in expected}
-        for key, future in futures.items():
-            value = self._value(future, key)
-            sha256 = None if value is None else hashlib.sha256(value).hexdigest()
-            yield key, len(value or b""), sha256
-        for key, wanted in expected.items() if self.folder else ():
-            size, sha256 = self._size(key), None
-            if size == wanted:
-                with self._refusing(key), open(self._place(key), "rb") as file:
-                    sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-            yield key, size or 0, sha256
+        for key in most if self.folder is not None else ():
+            try:
+                found = os.stat(os.path.join(self.folder or "", key))
+            except (FileNotFoundError, NotADirectoryError):
+                continue
+            except OSError as error:
+                raise InputError(
+                    f"{self.path(key)}: cannot be read: {error.strerror}: "
+                    "expected a dataset's file"
+                ) from error
+            if not stat.S_ISREG(found.st_mode):  # of a pipe one would wait for bytes
+                raise InputError(f"{self.path(key)}: expected a file")
+            self._check_size(key, found.st_size, most[key])
+        values = {}
+        for key, future in {key: self.kv.read(key) for key in most}.items():
+            result = self.wait(future, key)
+            values[key] = result.value if result.state == "value" else None
+            self._check_size(key, len(values[key] or b""), most[key])
+        return values
 
-    def _value(self, future: "ts.Future", key: str) -> bytes | None:
-        found = self.wait(future, key)
-        return found.value if found.state == "value" else None
-
-    def _place(self, key: str) -> str:
-        return os.path.join(self.folder or "", key)
-
-    def _size(self, key: str) -> int | None:
-        """Bytes of a file in a folder; None where there is none, or no folder."""
-        if self.folder is None:
-            return None
-        try:
-            with self._refusing(key):
-                found = os.stat(self._place(key))
-        except (FileNotFoundError, NotADirectoryError):
-            return None
-        if not stat.S_ISREG(found.st_mode):
-            raise InputError(f"{self.path(key)}: expected a file")
-        return found.st_size
-
-    @contextlib.contextmanager
-    def _refusing(self, key: str) -> Iterator[None]:
-        """What the system says of a file that is there, as a refusal."""
-        try:
-            yield
-        except (FileNotFoundError, NotADirectoryError):
-            raise
-        except OSError as error:
-            raise InputError(
-                f"{self.path(key)}: cannot be read: {error.strerror}: "
-                "expected a dataset's file"
-            ) from error
-
-    def _check_size(self, key: str, size: int | None) -> None:
-        most = JSON_BYTES[key.rpartition("/")[2]]
-        if size is not None and size > most:
+    def _check_size(self, key: str, size: int, most: int) -> None:
+        if size > most:
             raise InputError(f"{self.path(key)}: {size} bytes: expected {most} at most")
 
+    def read_json(self, key: str) -> bytes | None:
+        """Read one of the dataset's JSON files; arguments and errors as `read`."""
+        return self.read({key: JSON_BYTES[key.rpartition("/")[2]]})[key]
+
     def write_many(self, values: Mapping[str, bytes]) -> None:
-        """Each value atomically; returns when all are on disk."""
+        """Write each value atomically; returns when all are on disk.
+
+        Raises:
+          OSError: one cannot be written.
+        """
         futures = []
         try:
             for key, value in values.items():
@@ -184,13 +150,13 @@ class Files:
 
 
 def _reason(error: ValueError) -> str:
-    """A message of tensorstore without the specification it appends in brackets."""
+    """Return tensorstore's message without the specification in brackets."""
     return str(error).split(" [")[0]
 
 
 @functools.cache
 def context() -> ts.Context:
-    """One context for all, so that a memory:// URL means one thing."""
+    """Return one context for all, so that a memory:// URL means one thing."""
     return ts.Context()
 
 

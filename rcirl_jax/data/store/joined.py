@@ -2,46 +2,20 @@
 
 import hashlib
 from collections.abc import Sequence
-from typing import Protocol
 
 import jax
 import numpy as np
 
-from rcirl_jax.data.store.dataset import Dataset, open_dataset
+from rcirl_jax.data.store.dataset import Dataset, Demonstrations, open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Demonstration
 
+__all__ = ["Demonstrations", "JoinedDatasets", "open_datasets", "shares_of"]
 
-class Demonstrations(Protocol):
-    """What training and export need of a dataset."""
-
-    @property
-    def hash(self) -> str:
-        """Identity of the whole contents."""
-        ...
-
-    def indices(self, split: str | None) -> np.ndarray:
-        """Row numbers of a split in ascending order."""
-        ...
-
-    def blocks(self, indices: np.ndarray) -> np.ndarray:
-        """Number of the block, unpacked together, that each row lies in."""
-        ...
-
-    def load(self, split: str | None) -> Demonstration:
-        """All rows of a split in memory."""
-        ...
-
-    def weights(self, indices: np.ndarray) -> np.ndarray:
-        """[m] float32 weight of each scene in a training loss; 1 in a single source."""
-        ...
-
-    def read(self, indices: np.ndarray) -> Demonstration:
-        """Rows by number, in the order asked for."""
-        ...
+EQUAL, SCENES = "equal", "scenes"
 
 
-class JoinedDatasets:
+class JoinedDatasets(Demonstrations):
     """Datasets one after the other; row numbers run on.
 
     Vehicle, recording and group numbers keep their meaning inside each part
@@ -66,7 +40,7 @@ class JoinedDatasets:
         Raises:
           InputError: another number of shares, or one that is not positive.
         """
-        self._parts = tuple(parts)
+        self.parts = tuple(parts)
         self._starts = np.cumsum([0, *(part.count for part in parts)])
         self.shares = None if shares is None else tuple(float(x) for x in shares)
         self._weights = np.ones(len(parts), np.float32)
@@ -82,67 +56,56 @@ class JoinedDatasets:
             self._weights = each.astype(np.float32)
 
     @property
-    def parts(self) -> tuple[Dataset, ...]:
-        """The sources."""
-        return self._parts
-
-    @property
     def hash(self) -> str:
         """sha256 of the parts' hashes in order, and of their shares."""
-        text = "\n".join(part.hash for part in self._parts)
+        text = "\n".join(part.hash for part in self.parts)
         if self.shares is not None:
             text += f"\n{self.shares}"
         return hashlib.sha256(text.encode()).hexdigest()
-
-    def weights(self, indices: np.ndarray) -> np.ndarray:
-        """[m] float32 weight of each scene in a training loss."""
-        rows = np.asarray(indices, np.int64)
-        owner = np.searchsorted(self._starts, rows, side="right") - 1
-        return self._weights[owner]
 
     @property
     def count(self) -> int:
         """Number of rows."""
         return int(self._starts[-1])
 
+    def _owners(self, indices: np.ndarray) -> np.ndarray:
+        rows = np.asarray(indices, np.int64)
+        return np.searchsorted(self._starts, rows, side="right") - 1
+
+    def weights(self, indices: np.ndarray) -> np.ndarray:
+        """Return the weight [m] float32 of each scene in a training loss."""
+        return self._weights[self._owners(indices)]
+
     def indices(self, split: str | None) -> np.ndarray:
-        """[m] int64 row numbers of a split in ascending order."""
-        pairs = zip(self._parts, self._starts[:-1], strict=True)
+        """Return row numbers [m] int64 of a split (None: of all), ascending."""
+        pairs = zip(self.parts, self._starts[:-1], strict=True)
         return np.concatenate([part.indices(split) + start for part, start in pairs])
 
     def blocks(self, indices: np.ndarray) -> np.ndarray:
-        """[m] number of the block of rows, unpacked together, that each lies in."""
+        """Return the number [m] of the block, unpacked together, of each row."""
         numbers, first = np.empty(indices.size, np.int64), 0
-        for part, start in zip(self._parts, self._starts[:-1], strict=True):
-            own = part.blocks(np.arange(part.count))
-            at = np.flatnonzero((indices >= start) & (indices < start + part.count))
-            numbers[at] = first + own[indices[at] - start]
-            first += int(own[-1]) + 1
+        owner = self._owners(indices)
+        for number, part in enumerate(self.parts):
+            at = owner == number
+            numbers[at] = first + part.blocks(indices[at] - self._starts[number])
+            first += int(part.blocks(np.array([part.count - 1]))[0]) + 1
         return numbers
 
-    def load(self, split: str | None) -> Demonstration:
-        """All rows of a split (None: of all splits) in memory."""
-        return self.read(self.indices(split))
-
     def read(self, indices: np.ndarray) -> Demonstration:
-        """Rows by number, numpy leaves [m, ...], in the order asked for."""
-        rows = np.asarray(indices, np.int64)
-        owner = np.searchsorted(self._starts, rows, side="right") - 1
+        """Read rows by number, numpy leaves [m, ...], in the order asked for."""
+        owner = self._owners(indices)
         found, places = [], []
         for number in np.unique(owner).tolist():
             at = np.flatnonzero(owner == number)
-            found.append(self._parts[number].read(rows[at] - self._starts[number]))
+            rows = np.asarray(indices)[at] - self._starts[number]
+            found.append(self.parts[number].read(rows))
             places.append(at)
         back = np.argsort(np.concatenate(places))
-        join = lambda *leaves: np.concatenate(leaves)[back]  # noqa: E731
-        return jax.tree.map(join, *found)
-
-
-EQUAL, SCENES = "equal", "scenes"
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves)[back], *found)
 
 
 def shares_of(text: str, count: int) -> tuple[float, ...] | None:
-    """Shares of `count` sources from a flag: "equal", "scenes", or one number each.
+    """Return shares of `count` sources from "equal", "scenes", or one number each.
 
     Raises:
       InputError: none of these.
@@ -166,7 +129,7 @@ def shares_of(text: str, count: int) -> tuple[float, ...] | None:
 def open_datasets(
     urls: Sequence[str], verify: bool = True, weights: str = EQUAL
 ) -> Dataset | JoinedDatasets:
-    """One dataset as it is, or several joined.
+    """Open one dataset as it is, or several joined.
 
     Args:
       urls: dataset folders or tensorstore URLs.

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, TypedDict
 
 import msgspec
 import numpy as np
@@ -16,9 +16,16 @@ from rcirl_jax.runtime.checked import checked
 from rcirl_jax.units import NUM_TIMES, TIMES_S
 
 SCHEMA_VERSION = 2  # of manifest.json and shard.json
-SHA256 = r"\A[0-9a-f]{64}\Z"
 MAX_ROWS = 2**31  # rows of a dataset
 Rows = Annotated[int, msgspec.Meta(ge=0, le=MAX_ROWS)]
+Sha256 = Annotated[str, msgspec.Meta(pattern=r"\A[0-9a-f]{64}\Z")]
+
+
+class FileEntry(TypedDict):
+    """A file of a shard."""
+
+    bytes: Annotated[int, msgspec.Meta(ge=0)]
+    sha256: Sha256
 
 
 class ShardInfo(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -28,8 +35,21 @@ class ShardInfo(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     index: Rows
     count: Rows
     lineage: list[dict]  # recordings in it, as the import described them
-    files: dict[str, Any]  # key below the shard -> {"bytes", "sha256"}
+    files: dict[str, FileEntry]  # by key below the shard
     sha256: str  # over the fields above
+
+
+class ShardEntry(TypedDict):
+    """A shard in the manifest: its digest, and what it was made of.
+
+    "recordings" maps their names to the sha256 of what was cut into scenes and of how
+    (`importing.RecordingScenes.sha256`); null where nothing was recorded, as of planned
+    drives.
+    """
+
+    count: Rows
+    sha256: str
+    recordings: dict[str, str | None]
 
 
 class Manifest(
@@ -51,31 +71,10 @@ class Manifest(
     groups: list[str]
     vehicles: list[str]
     splits: dict[str, list[str]]  # group names per split
-    shards: list[dict]  # `shard_entry` by shard number
+    shards: list[ShardEntry]  # by number
     quality: dict  # data-quality report
     import_flags: dict
     hash: str  # sha256 over the canonical manifest without this field
-
-
-class _File(msgspec.Struct, forbid_unknown_fields=True):
-    """An entry of `ShardInfo.files`."""
-
-    bytes: Annotated[int, msgspec.Meta(ge=0)]
-    sha256: Annotated[str, msgspec.Meta(pattern=SHA256)]
-
-
-class _Recordings(msgspec.Struct):
-    """An entry of `ShardInfo.lineage`."""
-
-    name: str
-
-
-class _Shard(msgspec.Struct):
-    """An entry of `Manifest.shards`."""
-
-    count: Rows
-    sha256: str
-    recordings: dict = {}  # datasets of the first version do not say
 
 
 def _canonical(payload: Mapping) -> str:
@@ -87,7 +86,7 @@ def _canonical(payload: Mapping) -> str:
 
 
 def seal(payload: Mapping, field: str) -> bytes:
-    """JSON bytes of the payload with its own digest as one more field."""
+    """Return JSON bytes of the payload with its own digest as one more field."""
     whole = {**payload, field: _canonical(payload)}
     return (json.dumps(whole, sort_keys=True, indent=1) + "\n").encode()
 
@@ -113,32 +112,8 @@ def unseal(raw: bytes, field: str, name: str) -> dict:
     return payload
 
 
-def shard_entry(info: ShardInfo) -> dict:
-    """What the manifest says of a shard: its digest, and what it was made of.
-
-    "recordings" maps their names to the sha256 of what was cut into scenes and of
-    how (`cut.Cut.sha256`); null where nothing was recorded, as of planned drives.
-    """
-    made_of = {entry["name"]: entry.get("sha256") for entry in info.lineage}
-    return {"count": info.count, "sha256": info.sha256, "recordings": made_of}
-
-
-def parse_shard(raw: bytes, name: str) -> ShardInfo:
-    """What shard.json says, from its bytes, or InputError for what does not fit."""
-    info = checked(unseal(raw, "sha256", name), ShardInfo, name)
-    for file, found in info.files.items():
-        if not file.isprintable():
-            raise InputError(f"{name}: files: {file!a}: expected a printable key")
-        parts = file.split("/")
-        if not all(parts) or {".", ".."} & set(parts):
-            raise InputError(f"{name}: files: {file}: expected a key below the shard")
-        checked(found, _File, f"{name}: files: {file}")
-    checked(info.lineage, list[_Recordings], f"{name}: lineage")
-    return info
-
-
 def array_table() -> dict[str, dict]:
-    """Shape and dtype of every array, as the manifest states them."""
+    """Return shape and dtype of every array, as the manifest states them."""
     return {
         name: {"shape": list(leaf.shape), "dtype": np.dtype(leaf.dtype).name}
         for name, leaf in leaf_specs().items()
@@ -146,10 +121,13 @@ def array_table() -> dict[str, dict]:
 
 
 def parse_manifest(raw: bytes, files: Files) -> Manifest:
-    """The manifest from its bytes, or InputError for what does not fit."""
+    """Return the manifest from its bytes.
+
+    Raises:
+      InputError: something does not fit; names the field.
+    """
     name = files.path(MANIFEST)
     manifest = checked(unseal(raw, "hash", name), Manifest, name)
-    checked(manifest.shards, list[_Shard], f"{name}: shards")
     ours = array_table()
     for leaf in sorted(ours.keys() | manifest.arrays.keys()):
         found, expected = manifest.arrays.get(leaf), ours.get(leaf)
@@ -165,13 +143,9 @@ def parse_manifest(raw: bytes, files: Files) -> Manifest:
         raise InputError(
             f"{name}: splits: {manifest.splits}: expected every group exactly once"
         )
-    return manifest
-
-
-def check_count(manifest: Manifest, name: str) -> None:
-    """The rows of a dataset are those of its shards; InputError if not."""
     total = sum(shard["count"] for shard in manifest.shards)
     if manifest.count != total:
         raise InputError(
             f"{name}: count: {manifest.count}: expected {total}, the sum of its shards"
         )
+    return manifest

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.data.store.splits import TEST, TRAIN, assign_groups
 from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.types import Demonstration, Tag
@@ -20,7 +20,7 @@ HOLDOUTS = ("groups", "vehicles", "recording", "validation")
 HELD_OUT = 0.25  # share of the vehicles, or of the training scenes
 
 
-class Resplit:
+class Resplit(Demonstrations):
     """A dataset seen through other splits.
 
     Args:
@@ -51,25 +51,21 @@ class Resplit:
         return text.hexdigest()
 
     def indices(self, split: str | None) -> np.ndarray:
-        """[m] row numbers of a split (None: of all) in ascending order."""
+        """Return row numbers [m] of a split (None: of all), ascending."""
         if split is None:
             return np.sort(np.concatenate(list(self._splits.values())))
         return self._splits[split]
 
     def blocks(self, indices: np.ndarray) -> np.ndarray:
-        """[m] number of the block of rows, unpacked together, that each lies in."""
+        """Return the number [m] of the block, unpacked together, of each row."""
         return self._dataset.blocks(indices)
 
     def weights(self, indices: np.ndarray) -> np.ndarray:
-        """[m] float32 weight of each scene in a training loss."""
+        """Return the weight [m] float32 of each scene in a training loss."""
         return self._dataset.weights(indices)
 
-    def load(self, split: str | None) -> Demonstration:
-        """All rows of a split in memory."""
-        return self._dataset.read(self.indices(split))
-
     def read(self, indices: np.ndarray) -> Demonstration:
-        """Rows by number, in the order asked for."""
+        """Read rows by number, in the order asked for."""
         return self._dataset.read(indices)
 
 
@@ -108,7 +104,7 @@ def by_recording(dataset: Demonstrations, recordings: Sequence[int]) -> Resplit:
 
 
 def folds_by_recording(dataset: Demonstrations, count: int) -> list[Resplit]:
-    """Every scene held out once: recordings dealt into parts, one held out at a time.
+    """Hold every scene out once: recordings dealt into parts, one held out at a time.
 
     The largest recording first, each to the part with fewest scenes. As in
     `by_recording`, the ego of a held-out scene is that of no training scene, but may
@@ -138,7 +134,7 @@ def folds_by_recording(dataset: Demonstrations, count: int) -> list[Resplit]:
 
 
 def with_tags(dataset: Demonstrations, names: Sequence[str]) -> Demonstrations:
-    """Only the scenes with one of these tags; all of them without a name.
+    """Keep the scenes with one of these tags; all of them without a name.
 
     Args:
       dataset: any dataset with splits "train" and "test".
@@ -170,8 +166,8 @@ def with_tags(dataset: Demonstrations, names: Sequence[str]) -> Demonstrations:
     return Resplit(dataset, {k: rows for k, rows in splits.items() if rows.size})
 
 
-def fewer(dataset: Demonstrations, count: int, seed: int) -> Resplit:
-    """The same test split, and `count` training scenes drawn by vehicle.
+def subsample(dataset: Demonstrations, count: int, seed: int) -> Resplit:
+    """Keep the test split, and `count` training scenes drawn by vehicle.
 
     Whole vehicles are taken in a drawn order until the count is reached, so
     that few scenes also means few drivers; nested: more scenes contain fewer.
@@ -237,7 +233,7 @@ def held_out(
     seed: int = 0,
     recordings: Sequence[int] = (0,),
 ) -> tuple[Demonstrations, str]:
-    """The dataset split anew, as one of `HOLDOUTS` says.
+    """Split the dataset anew, as one of `HOLDOUTS` says.
 
     groups leaves the dataset's split; vehicles holds out `HELD_OUT` of the egos;
     recording holds out some; validation holds out `HELD_OUT` of the training scenes

@@ -26,12 +26,9 @@ _T = TypeVar("_T")
 def _node(
     kind: type[_T], shape: tuple, dtype: type = np.float32, /, **other: tuple
 ) -> _T:
-    """A pytree node whose leaves have one shape and dtype, but for `other`."""
-    leaves = {}
-    for field in dataclasses.fields(cast(Any, kind)):
-        size, of = other.get(field.name, (shape, dtype))
-        leaves[field.name] = _leaf(size, of)
-    return kind(**leaves)
+    """Return a pytree node whose leaves have one shape and dtype, but for `other`."""
+    names = (field.name for field in dataclasses.fields(cast(Any, kind)))
+    return kind(**{x: _leaf(*other.get(x, (shape, dtype))) for x in names})
 
 
 def _leaf(shape: tuple, dtype: type) -> jax.Array:
@@ -40,7 +37,7 @@ def _leaf(shape: tuple, dtype: type) -> jax.Array:
 
 
 def row_spec() -> Demonstration:
-    """Shape and dtype of every leaf of one stored row."""
+    """Return shape and dtype of every leaf of one stored row."""
     slots, motion = (NUM_OBSTACLES,), (NUM_OBSTACLES, NUM_TIMES)
     scene = Scene(
         ego=_node(Ego, ()),
@@ -69,19 +66,19 @@ def row_spec() -> Demonstration:
 
 
 def named_leaves(rows: Demonstration) -> dict[str, Any]:
-    """Leaves by path, e.g. "scene.path.kappa", in the order of the tree."""
+    """Return leaves by path, e.g. "scene.path.kappa", in the order of the tree."""
     flat, _ = jax.tree_util.tree_flatten_with_path(rows)
     return {".".join(key.name for key in path): leaf for path, leaf in flat}
 
 
 @functools.cache
 def leaf_specs() -> dict[str, jax.ShapeDtypeStruct]:
-    """Shape and dtype of one row's leaves by name."""
+    """Return shape and dtype of one row's leaves by name."""
     return named_leaves(row_spec())
 
 
 def checked_leaves(rows: Demonstration) -> dict[str, np.ndarray]:
-    """Leaves as contiguous arrays; ValueError where one is not `[n, *spec]`."""
+    """Return leaves as contiguous arrays; ValueError if one is not `[n, *spec]`."""
     leaves = {k: np.ascontiguousarray(v) for k, v in named_leaves(rows).items()}
     count = leaves["vehicle"].size
     for name, spec in leaf_specs().items():
@@ -97,7 +94,7 @@ def checked_leaves(rows: Demonstration) -> dict[str, np.ndarray]:
 
 
 def scene_name(rows: Demonstration, at: int, row: int) -> str:
-    """A scene in one line: its dataset row and the numbers that it carries.
+    """Name a scene in one line: its dataset row and the numbers that it carries.
 
     Recording and vehicle number the manifest's tables, the frame those of the
     recording.
@@ -113,7 +110,7 @@ def scene_name(rows: Demonstration, at: int, row: int) -> str:
 
 
 def unusable_leaves(rows: Demonstration, at: int) -> list[str]:
-    """Names of a scene's stored leaves that hold a NaN or an infinity."""
+    """Return names of a scene's leaves that hold a NaN or an infinity."""
     return [
         name
         for name, leaf in named_leaves(rows).items()

@@ -1,5 +1,6 @@
 """Writing a dataset, shard by shard; the form on disk is `dataset`'s."""
 
+import contextlib
 import json
 import os
 import re
@@ -11,11 +12,11 @@ from rcirl_jax.data.store.files import JSON_BYTES, MANIFEST, MARK, SHARDS, Files
 from rcirl_jax.data.store.manifest import (
     SCHEMA_VERSION,
     Manifest,
+    ShardEntry,
     ShardInfo,
     array_table,
     parse_manifest,
     seal,
-    shard_entry,
 )
 from rcirl_jax.data.store.rows import checked_leaves
 from rcirl_jax.data.store.shards import (
@@ -30,17 +31,6 @@ from rcirl_jax.types import Demonstration
 from rcirl_jax.units import TIMES_S
 
 SHARDS_END = "shards0"  # first key after all that begin with "shards/"
-# what the import hands to `DatasetWriter.finish`; the writer knows the rest
-IMPORT_FIELDS = (
-    "rate_hz",
-    "sources",
-    "recordings",
-    "groups",
-    "vehicles",
-    "splits",
-    "quality",
-    "import",
-)
 
 
 class DatasetWriter:
@@ -61,7 +51,6 @@ class DatasetWriter:
           InputError: a finished dataset without `overwrite`; other files.
         """
         self._files = Files(url)
-        self._missing_folders = _missing_folders(self._files.folder)
         keys = self._files.list_keys()
         shards = any(re.match(SHARDS + r"\d{5}/", key) for key in keys)
         if keys and not shards and MANIFEST not in keys:
@@ -74,24 +63,17 @@ class DatasetWriter:
                 f"{self._files.name}: holds a finished dataset: "
                 "expected a new folder, or overwrite to replace it"
             )
-        # one `shard_entry` a shard: lineages of a long log would fill the memory
-        self._shards = [] if overwrite or not shards else self._find_committed()
+        # no `ShardInfo`: lineages of a long log would fill the memory
+        self._shards: list[ShardEntry] = []
+        with contextlib.suppress(InputError):  # of the first shard that is not whole
+            while shards and not overwrite:
+                info = verify_shard(self._files, len(self._shards))
+                self._shards.append(_entry(info))
         self._first_written: int | None = None
         self._finished = False
 
-    def _find_committed(self) -> list[dict]:
-        found = []
-        while True:
-            try:
-                found.append(shard_entry(verify_shard(self._files, len(found))))
-            except InputError:
-                return found
-
     def committed(self) -> list[ShardInfo]:
-        """The shards already there and whole, from number 0 on without a gap.
-
-        Read from disk; the writer itself remembers digests only.
-        """
+        """Read the shards already there and whole, from number 0 on without a gap."""
         return [
             shard_info(self._files, index, shard["sha256"])
             for index, shard in enumerate(self._shards)
@@ -99,7 +81,7 @@ class DatasetWriter:
 
     def write_shard(
         self, index: int, demonstrations: Demonstration, lineage: list[dict]
-    ) -> ShardInfo:
+    ) -> None:
         """Write and commit the next shard; removes remains of an earlier attempt.
 
         Args:
@@ -115,30 +97,27 @@ class DatasetWriter:
         """
         if index != len(self._shards):
             raise ValueError(f"shard {index}: expected {len(self._shards)} next")
-        leaves = checked_leaves(demonstrations)
-        values = encode(leaves)
+        leaves, key = checked_leaves(demonstrations), shard_key(index)
+        values = {key + file: value for file, value in encode(leaves).items()}
         payload = {
             "schema_version": SCHEMA_VERSION,
             "index": index,
             "count": int(leaves["vehicle"].size),
             "lineage": lineage,
-            "files": {key: describe(value) for key, value in values.items()},
+            "files": {k.removeprefix(key): describe(v) for k, v in values.items()},
         }
-        key = shard_key(index)
         mark = self._readable(seal(payload, "sha256"), key + MARK)
         if self._first_written is None:
             self._first_written = index
         self._remove_from(index)
         try:
-            self._files.write_many({key + file: v for file, v in values.items()})
+            self._files.write_many(values)
             self._files.write_many({key + MARK: mark})
         except OSError as error:
             if index > 0:
                 raise
             raise InputError(f"{error}: expected a place to write to") from error
-        info = ShardInfo(**json.loads(mark))
-        self._shards.append(shard_entry(info))
-        return info
+        self._shards.append(_entry(ShardInfo(**json.loads(mark))))
 
     def _readable(self, raw: bytes, key: str) -> bytes:
         """Refuse to write what would not be read again; what is finished stays."""
@@ -165,7 +144,8 @@ class DatasetWriter:
         """Commit the dataset: check the tables, write manifest.json.
 
         Args:
-          manifest_fields: exactly `IMPORT_FIELDS`, JSON-ready.
+          manifest_fields: the fields of `Manifest` from `rate_hz` on but `shards` and
+            `hash`, JSON-ready.
           before_commit: what else belongs to a finished import; a run that is killed
             in it is resumed, and its bad input is raised after the commit.
 
@@ -173,9 +153,6 @@ class DatasetWriter:
           InputError: a vehicle has rows in two splits.
           LostWorkError: more names than a manifest holds; the shards are sound.
         """
-        if set(manifest_fields) != set(IMPORT_FIELDS):
-            different = sorted(set(manifest_fields) ^ set(IMPORT_FIELDS))
-            raise ValueError(f"manifest: {different}: expected {IMPORT_FIELDS}")
         if not self._shards:
             raise ValueError("dataset: 0 shards: expected at least one")
         payload = {
@@ -202,20 +179,18 @@ class DatasetWriter:
         return dataset.manifest
 
     def abort(self) -> None:
-        """Remove what this writer wrote; shards resumed from stay as they were."""
+        """Remove what this writer wrote; shards resumed from stay as they were.
+
+        Folders made for the dataset go with `Files.alone`.
+        """
         if self._finished or self._first_written is None:
             return
         self._remove_from(self._first_written)
-        inner = [os.path.join(self._files.folder, SHARDS)] if self._files.folder else []
-        for folder in inner + self._missing_folders:
-            if os.path.isdir(folder) and not os.listdir(folder):
-                os.rmdir(folder)
+        if self._files.folder is not None:
+            with contextlib.suppress(OSError):  # shards before are in it
+                os.rmdir(os.path.join(self._files.folder, SHARDS))
 
 
-def _missing_folders(folder: str | None) -> list[str]:
-    """Folders that writing into `folder` will create, innermost first."""
-    missing = []
-    while folder is not None and not os.path.lexists(folder):
-        missing.append(folder)
-        folder = os.path.dirname(folder)
-    return missing
+def _entry(info: ShardInfo) -> ShardEntry:
+    made_of = {entry["name"]: entry.get("sha256") for entry in info.lineage}
+    return {"count": info.count, "sha256": info.sha256, "recordings": made_of}

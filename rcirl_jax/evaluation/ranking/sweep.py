@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 from rcirl_jax.data.store.joined import Demonstrations, open_datasets
-from rcirl_jax.data.store.resplit import Resplit, fewer, with_validation
+from rcirl_jax.data.store.resplit import Resplit, subsample, with_validation
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.evaluate import (
     RankingSetup,
@@ -201,7 +201,7 @@ def open_split(
     """(all data; splits "train", "validation", "test"; what the cut goes by)."""
     dataset = open_datasets(config.data, verify=verify)
     seed = config.base.seed
-    part = fewer(dataset, config.scenes, seed) if config.scenes else dataset
+    part = subsample(dataset, config.scenes, seed) if config.scenes else dataset
     return dataset, *with_validation(part, config.validation, seed)
 
 

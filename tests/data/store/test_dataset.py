@@ -241,14 +241,15 @@ def test_abort_leaves_nothing(tmp_path, monkeypatch, existed, writes):
     folder = tmp_path / "deep" / "dataset"
     if existed:
         folder.mkdir(parents=True)
-    writer = DatasetWriter(folder)
-    writer.abort()
     interrupt_after(monkeypatch, writes)
-    with contextlib.suppress(Interrupted):
-        writer.write_shard(0, make_rows(5), [])
-        writer.write_shard(1, make_rows(5), [])
-    assert any(path.is_file() for path in folder.rglob("*"))
-    writer.abort()
+    with files.Files(folder).alone():
+        writer = DatasetWriter(folder)
+        writer.abort()
+        with contextlib.suppress(Interrupted):
+            writer.write_shard(0, make_rows(5), [])
+            writer.write_shard(1, make_rows(5), [])
+        assert any(path.is_file() for path in folder.rglob("*"))
+        writer.abort()
     left = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*"))
     assert left == (["deep", "deep/dataset"] if existed else [])
 
@@ -324,7 +325,7 @@ def test_wrong_shards(tmp_path, index, change, words):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"extra": 1}, "extra"),
+        ({"extra": 1}, "extra: unknown"),
         ({"vehicles": ["v0"]}, r"vehicle: \d+ to \d+: 1 names"),
         ({"splits": {"train": ["g0"], "test": ["g1"]}}, "every group exactly once"),
     ],

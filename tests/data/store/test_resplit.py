@@ -10,9 +10,9 @@ from rcirl_jax.data.store.resplit import (
     Resplit,
     by_recording,
     by_vehicle,
-    fewer,
     folds_by_recording,
     held_out,
+    subsample,
     with_tags,
 )
 from rcirl_jax.errors import InputError
@@ -92,7 +92,7 @@ def test_a_quarter_of_the_vehicles_by_seed():
 
 
 def test_fewer_is_nested_and_keeps_the_test_rows():
-    few, more = fewer(Rows(), 20, 0), fewer(Rows(), 60, 0)
+    few, more = subsample(Rows(), 20, 0), subsample(Rows(), 60, 0)
     assert few.indices("train").size == 20
     assert set(few.indices("train")) <= set(more.indices("train"))
     assert np.unique(few.load("train").vehicle).size == 4

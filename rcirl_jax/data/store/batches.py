@@ -1,16 +1,25 @@
-"""Batches: seeded, endless, resumable to the bit, shared between processes."""
+"""Batches: seeded, endless, resumable to the bit, shared between processes.
+
+Rows in memory are taken by number. Rows on disk are read ahead in the order of their
+use: reading single rows at random would unpack a block of 256 for each, so every block
+is unpacked once, and its rows wait in memory for their turn.
+"""
 
 import concurrent.futures
 import dataclasses
+import functools
 import math
-from collections.abc import Mapping
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Generic, TypeVar
 
 import jax
 import numpy as np
 
-from rcirl_jax.data.store.joined import Demonstrations
-from rcirl_jax.data.store.rows import leaf_specs
-from rcirl_jax.data.store.stream import RowStream
+from rcirl_jax.data.store.dataset import Demonstrations
+from rcirl_jax.data.store.rows import leaf_specs, row_spec
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Demonstration
 
@@ -18,11 +27,14 @@ from rcirl_jax.types import Demonstration
 # Half of them are in memory at a time: 32,768 rows, 340 MB.
 WINDOW_BLOCKS = 256
 PLAN_AHEAD = 0.1  # share of an epoch before whose end the next one is planned
+READ_ROWS = 4096  # rows read at a time at most, so that reading needs little memory
 ROW_BYTES = sum(math.prod(x.shape) * x.dtype.itemsize for x in leaf_specs().values())
+
+T = TypeVar("T")
 
 
 def epoch_order(seed: int, epoch: int, blocks: np.ndarray) -> np.ndarray:
-    """[n] the order in which an epoch visits n rows.
+    """Return the order [n] in which an epoch visits n rows.
 
         key(row) = place(block of row) + WINDOW_BLOCKS * u(row),   u ~ U(0, 1)
 
@@ -43,6 +55,69 @@ def epoch_order(seed: int, epoch: int, blocks: np.ndarray) -> np.ndarray:
     return np.argsort(key, kind="stable")
 
 
+class RowStream:
+    """Rows of a dataset in a given order, `size` at a time.
+
+    Rows of a block are read when the first of them is due, in one piece, and each
+    is forgotten once it has been given. Memory is what the order demands, known
+    beforehand and allocated once.
+    """
+
+    def __init__(
+        self, dataset: Demonstrations, rows: np.ndarray, blocks: np.ndarray, size: int
+    ) -> None:
+        """Plan the reads.
+
+        Args:
+          dataset: the open dataset.
+          rows: [m] row numbers in the order of use, repeats allowed.
+          blocks: [m] number of the block that each of them lies in.
+          size: rows given at a time; divides m.
+        """
+        self._dataset, self._rows, self._size = dataset, rows, size
+        first = np.zeros(int(blocks.max()) + 1, np.int64)
+        first[blocks[::-1]] = np.arange(blocks.size)[::-1]  # the last written stays
+        due = (first // size)[blocks]  # turn in which the row is read
+        self._by_turn = np.argsort(due, kind="stable")
+        loaded = np.cumsum(np.bincount(due, minlength=rows.size // size))
+        self._bounds = np.concatenate([[0], loaded])
+        self.capacity = int(np.max(loaded - size * np.arange(loaded.size)))
+        self._slot = np.empty(rows.size, np.int32)  # where a row in memory stands
+        self._free = np.arange(self.capacity, dtype=np.int32)
+        self._turn = 0
+
+    def __iter__(self) -> "RowStream":
+        return self
+
+    def __next__(self) -> Demonstration:
+        turn, size = self._turn, self._size
+        if turn * size >= self._rows.size:
+            raise StopIteration
+        new = self._by_turn[self._bounds[turn] : self._bounds[turn + 1]]
+        new = new[np.argsort(self._rows[new], kind="stable")]
+        for start in range(0, new.size, READ_ROWS):
+            places = new[start : start + READ_ROWS]
+            slots, self._free = np.split(self._free, [places.size])
+            self._slot[places] = slots
+            found = self._dataset.read(self._rows[places])
+            for leaf, values in zip(
+                jax.tree.leaves(self._held), jax.tree.leaves(found), strict=True
+            ):
+                leaf[slots] = values
+        slots = self._slot[turn * size : (turn + 1) * size]
+        given = jax.tree.map(lambda leaf: leaf[slots], self._held)
+        self._free = np.concatenate([self._free, slots])
+        self._turn += 1
+        return given
+
+    @functools.cached_property
+    def _held(self) -> Demonstration:
+        """The rows in memory, [capacity, ...], allocated when the first is due."""
+        return jax.tree.map(
+            lambda leaf: np.empty((self.capacity, *leaf.shape), leaf.dtype), row_spec()
+        )
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Epoch:
     """The plan of an epoch: its order, and what reads it from disk."""
@@ -61,18 +136,17 @@ def split_batches(
     shard_index: int = 0,
     num_shards: int = 1,
 ) -> "BatchIterator":
-    """Batches of a split, named by their rows in the dataset.
+    """Return batches of a split, named by their rows in the dataset.
 
     A split of at most `in_memory_mb` MiB is loaded, a larger one is read as the
     batches need it: the batches are the same to the bit.
     """
     index = dataset.indices(split)
-    blocks = dataset.blocks(index)
     small = index.size * ROW_BYTES <= in_memory_mb * 2**20
     return BatchIterator(
         dataset.load(split) if small else dataset,
         indices=None if small else index,
-        blocks=blocks,
+        blocks=dataset.blocks(index),
         numbers=index,
         batch_size=batch_size,
         seed=seed,
@@ -134,19 +208,24 @@ class BatchIterator:
             blocks = rows.blocks(self._chosen) if stored else alone
         self._blocks = np.unique(blocks, return_inverse=True)[1].astype(np.int32)
         self._numbers = self._chosen if numbers is None else numbers
-        if self._chosen.size == 0:
-            raise InputError("batches: rows: 0: expected at least one scene")
-        if batch_size < 1 or num_shards < 1 or batch_size % num_shards:
-            raise InputError(
-                f"batches: batch_size: {batch_size}: expected a positive multiple "
-                f"of the number of processes, {num_shards}"
-            )
-        if not 0 <= shard_index < num_shards:
-            raise InputError(
-                f"batches: shard_index: {shard_index}: expected 0 to {num_shards - 1}"
-            )
-        if seed < 0:
-            raise InputError(f"batches: seed: {seed}: expected >= 0")
+        for name, value, is_good, expected in (
+            ("rows", self._chosen.size, self._chosen.size > 0, "at least one scene"),
+            (
+                "batch_size",
+                batch_size,
+                batch_size >= 1 and num_shards >= 1 and batch_size % num_shards == 0,
+                f"a positive multiple of the number of processes, {num_shards}",
+            ),
+            (
+                "shard_index",
+                shard_index,
+                0 <= shard_index < num_shards,
+                f"0 to {num_shards - 1}",
+            ),
+            ("seed", seed, seed >= 0, ">= 0"),
+        ):
+            if not is_good:
+                raise InputError(f"batches: {name}: {value}: expected {expected}")
         self._batch_size, self._seed = batch_size, seed
         local = batch_size // num_shards
         self._part = np.arange(shard_index * local, (shard_index + 1) * local)
@@ -161,7 +240,7 @@ class BatchIterator:
         return -(-self._chosen.size // self._batch_size)
 
     def state(self) -> dict[str, int]:
-        """Where the next batch stands; JSON-ready, the same in every process."""
+        """Return where the next batch stands; JSON-ready, equal in every process."""
         return {"epoch": self._epoch, "position": self._position, "seed": self._seed}
 
     def restore(self, state: Mapping[str, int]) -> None:
@@ -195,42 +274,89 @@ class BatchIterator:
 
     def __next__(self) -> tuple[Demonstration, np.ndarray, np.ndarray]:
         plan = self._plan or self._planned(self._epoch, self._position)
-        self._plan = plan
+        self._plan, count = plan, self._chosen.size
         places = self._position * self._batch_size + self._part
-        visited = self._visited(plan.order, places)
-        weight = (places < self._chosen.size).astype(np.float32)
-        batch = self._take(plan, self._chosen[visited])
+        visited = plan.order[places % count]
+        if isinstance(self._rows, Demonstration):
+            rows = self._chosen[visited]
+            batch = jax.tree.map(lambda leaf: leaf[rows], self._rows)
+        else:
+            assert plan.stream is not None
+            batch = next(plan.stream)
         self._position += 1
         if self._position == self.batches_per_epoch:
             self._epoch, self._position = self._epoch + 1, 0
             self._plan = self._later.result() if self._later else None
             self._later = None
-        elif self._later is None and self._is_late():
-            # the step need not wait for the plan of the next epoch
+        elif self._later is None and (
+            self._position >= (1.0 - PLAN_AHEAD) * self.batches_per_epoch
+        ):  # the step need not wait for the plan of the next epoch
             self._later = self._planner.submit(self._planned, self._epoch + 1, 0)
-        return batch, weight, self._numbers[visited]
-
-    def _is_late(self) -> bool:
-        return self._position >= (1.0 - PLAN_AHEAD) * self.batches_per_epoch
-
-    def _visited(self, order: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Which of the chosen rows stand at some places of an epoch's order."""
-        return order[places % self._chosen.size]
+        return batch, (places < count).astype(np.float32), self._numbers[visited]
 
     def _planned(self, epoch: int, position: int) -> _Epoch:
-        """An epoch, to be read from a position on."""
+        """Plan an epoch, to be read from a position on."""
         order, stream = epoch_order(self._seed, epoch, self._blocks), None
         if not isinstance(self._rows, Demonstration):
             batches = np.arange(position, self.batches_per_epoch)
             places = batches[:, None] * self._batch_size + self._part
-            ahead = self._visited(order, places.reshape(-1))
+            ahead = order[places.reshape(-1) % self._chosen.size]
             stream = RowStream(
                 self._rows, self._chosen[ahead], self._blocks[ahead], self._part.size
             )
         return _Epoch(order=order, stream=stream)
 
-    def _take(self, plan: _Epoch, index: np.ndarray) -> Demonstration:
-        if isinstance(self._rows, Demonstration):
-            return jax.tree.map(lambda leaf: leaf[index], self._rows)
-        assert plan.stream is not None
-        return next(plan.stream)
+
+class Prefetch(Generic[T]):
+    """Calls a function in a thread, a bounded number of results ahead.
+
+    `waited_s` is the time that `next` spent waiting for results.
+    """
+
+    def __init__(self, produce: Callable[[], T], depth: int) -> None:
+        """Start producing.
+
+        Args:
+          produce: gives the next result; StopIteration ends, any other exception
+            reaches the caller in its turn.
+          depth: finished results that may wait, >= 1.
+        """
+        self._results: queue.Queue[tuple[bool, Any]] = queue.Queue(depth)
+        self._stopped = threading.Event()
+        self._produce = produce
+        self.waited_s = 0.0
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        fine = True
+        while fine and not self._stopped.is_set():
+            try:
+                result = self._produce()
+            except BaseException as error:
+                fine, result = False, error
+            while not self._stopped.is_set():
+                try:
+                    self._results.put((fine, result), timeout=0.1)
+                    break
+                except queue.Full:
+                    continue
+
+    def __iter__(self) -> Iterator[T]:
+        return self
+
+    def __next__(self) -> T:
+        begin = time.perf_counter()
+        fine, result = self._results.get()
+        self.waited_s += time.perf_counter() - begin
+        if not fine:
+            self._results.put((fine, result))
+            raise result
+        return result
+
+    def __enter__(self) -> "Prefetch[T]":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stopped.set()
+        self._thread.join()
