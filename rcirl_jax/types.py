@@ -263,7 +263,7 @@ class Signal:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Ghost:
+class MissingAgent:
     """A road user known to be missing from the file (CommonRoad's ego).
 
     Its motion is bracketed by a start and an end; between them a straight
@@ -297,7 +297,7 @@ class Recording:
     tracks: tuple[Track, ...]
     lanes: tuple[Lane, ...]
     signals: tuple[Signal, ...] = ()
-    ghosts: tuple[Ghost, ...] = ()
+    missing_agents: tuple[MissingAgent, ...] = ()
     # vehicle-disjoint group of the whole recording; None: grouped by time block
     group: str | None = None
     default_speed_limit: float = 29.06  # m/s, where a lane has none (65 mph)

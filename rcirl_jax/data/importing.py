@@ -30,10 +30,8 @@ from rcirl_jax.data.inputs import (
     work_units,
 )
 from rcirl_jax.data.quality import QualityReport, remedies
-from rcirl_jax.data.scenes.assemble import CHUNK, assemble
-from rcirl_jax.data.scenes.collect import Collector
-from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.scenes.signal_checks import SignalChecks
+from rcirl_jax.data.scenes.collect import CHUNK, Collector, assemble
+from rcirl_jax.data.scenes.config import CollectConfig, SignalChecks
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.files import Files
 from rcirl_jax.data.store.manifest import Manifest

@@ -8,9 +8,8 @@ import numpy as np
 
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.filters import REASONS, REMEDIES
-from rcirl_jax.data.scenes.flicker import note_of
 from rcirl_jax.data.scenes.lines import TOO_FEW
-from rcirl_jax.data.scenes.smoothing import HARSH_MPS2, harsh_share
+from rcirl_jax.data.scenes.tracks import HARSH_MPS2, harsh_share, note_of
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.types import Decision, Demonstration, Kind, Recording, RowCounts, Tag
 

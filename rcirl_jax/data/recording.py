@@ -14,7 +14,7 @@ import numpy as np
 from rcirl_jax.data.motion_checks import check_against_motion
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.runtime.atomic_files import is_text
-from rcirl_jax.types import Ghost, Kind, Lane, Recording, Signal, Track
+from rcirl_jax.types import Kind, Lane, MissingAgent, Recording, Signal, Track
 
 # keys that an import adds to a spec
 LEAVE_OUT = "leave_out"  # refused recordings are left out
@@ -100,8 +100,8 @@ def validate_recording(
     begin = min(float(track.t[0]) for track in recording.tracks)
     for signal in recording.signals:
         _check_signal(name, signal, begin)
-    for ghost in recording.ghosts:
-        _check_ghost(name, ghost)
+    for agent in recording.missing_agents:
+        _check_missing_agent(name, agent)
     lanes = {lane.id for lane in recording.lanes}
     signals = {signal.id for signal in recording.signals}
     checked = [_check_lane(name, lane, lanes, signals) for lane in recording.lanes]
@@ -247,10 +247,10 @@ def _check_signal(name: str, signal: Signal, begin: float) -> None:
         )
 
 
-def _check_ghost(name: str, ghost: Ghost) -> None:
-    values = (ghost.t0, ghost.t1, *ghost.start, *ghost.end)
-    if not np.isfinite(values).all() or ghost.t1 < ghost.t0:
-        raise InputError(f"{name}: ghost: {values}: expected finite, t1 >= t0")
+def _check_missing_agent(name: str, agent: MissingAgent) -> None:
+    values = (agent.t0, agent.t1, *agent.start, *agent.end)
+    if not np.isfinite(values).all() or agent.t1 < agent.t0:
+        raise InputError(f"{name}: missing agent: {values}: expected finite, t1 >= t0")
 
 
 def _check_lane(name: str, lane: Lane, lanes: set[str], signals: set[str]) -> Lane:

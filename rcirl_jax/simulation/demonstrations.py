@@ -24,7 +24,7 @@ import jax
 import numpy as np
 
 from rcirl_jax.data.quality import QualityReport
-from rcirl_jax.data.scenes.assemble import assemble
+from rcirl_jax.data.scenes.collect import assemble
 from rcirl_jax.data.scenes.labels import add_labels
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.files import Files

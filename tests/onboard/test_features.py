@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.formats import read_recordings
-from rcirl_jax.data.scenes.assemble import stack_scenes
-from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.collect import Collector, stack_scenes
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.export.own_planner.plain import plain_scene
 from tests.helpers import drawn_scenes

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.data.scenes.assemble import assemble
-from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.collect import Collector, assemble
 from rcirl_jax.planner.plan import held
 from rcirl_jax.planner.prediction import (
     NUM_BODIES,

@@ -3,8 +3,7 @@
 import jax
 import numpy as np
 
-from rcirl_jax.data.scenes.assemble import assemble
-from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.collect import Collector, assemble
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.types import Kind, Lane, Recording, Track
 

@@ -7,15 +7,17 @@ is counted by reason.
 """
 
 import collections
+import functools
 import itertools
 from collections.abc import Iterator
+from typing import Any
 
+import jax
 import numpy as np
 
 from rcirl_jax.data.recording import MAX_SPEED_MPS
 from rcirl_jax.data.scenes import filters, labels
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.scenes.flicker import steady_tracks
 from rcirl_jax.data.scenes.lanes import LaneFrame, LaneGraph, project
 from rcirl_jax.data.scenes.lines import line_obstacles, trusted_signals
 from rcirl_jax.data.scenes.motion import (
@@ -27,11 +29,21 @@ from rcirl_jax.data.scenes.motion import (
     given_path,
     human_motion,
 )
-from rcirl_jax.data.scenes.smoothing import SmoothTrack, smooth_track
-from rcirl_jax.data.scenes.surroundings import surroundings_end
+from rcirl_jax.data.scenes.tracks import SmoothTrack, smooth_track, steady_tracks
 from rcirl_jax.geometry.limits import LOOK_AHEAD_M, planning_limit
 from rcirl_jax.geometry.relevance import relevance_distance
-from rcirl_jax.types import Ghost, Kind, Recording
+from rcirl_jax.sampling.kinematics import trajectory_from_positions
+from rcirl_jax.types import (
+    Demonstration,
+    Ego,
+    Kind,
+    MissingAgent,
+    Obstacles,
+    Path,
+    Recording,
+    Scene,
+    Trajectory,
+)
 from rcirl_jax.units import (
     HORIZON_S,
     NUM_OBSTACLES,
@@ -41,13 +53,14 @@ from rcirl_jax.units import (
 )
 
 VIEW_BEHIND_M = 60.0  # m, obstacles farther behind are not collected
-MAX_GHOST_POINTS = 1000  # of the line that a missing road user is taken to drive
+MAX_MISSING_POINTS = 1000  # of the line that a missing road user is taken to drive
 VIEW_BESIDE_M = 12.0  # m, obstacles farther beside are not collected
 VIEW_NUMBERS = 7  # float64 of a sample in a frame: s, l, tilt and the table of four
 # m, the scene's station grid and as far beyond it as its speed limits look
 LONG_GRID_M = np.arange(0.0, GRID_M[-1] + LOOK_AHEAD_M + 1e-6, STATION_STEP_M)
 BOX = ("s_lower", "s_upper", "l_lower", "l_upper", "speed", "valid")
 LABELLED_AT_ONCE = 64  # scenes
+CHUNK = 512  # scenes per device call; padded, so that it compiles once
 VIEWS_BYTES = 256 * 2**20  # of tracks kept in the frames of chains
 
 
@@ -72,7 +85,7 @@ class Collector:
         # of the scenes: how many end with their surroundings, times recorded, times cut
         self.ended: collections.Counter[str] = collections.Counter()
         self._views: dict[tuple[str, ...], FrameTracks] = {}
-        self._ghost_views: dict[tuple[str, ...], list[tuple[np.ndarray, ...]]] = {}
+        self._missing_views: dict[tuple[str, ...], list[tuple[np.ndarray, ...]]] = {}
         counts = [track.num_frames for track in self.tracks]
         self._first = np.array([track.first_frame for track in self.tracks])
         self._last = self._first + np.array(counts) - 1
@@ -200,8 +213,8 @@ class Collector:
         self._add_obstacles(row, number, start, frame, motion)
         if reason := self._end(row, number, motion):
             return reason
-        ghosts = self._ghosts(frame, start, number)
-        if reason := filters.reject(row, motion, self.config, ghosts):
+        missing = self._missing(frame, start, number)
+        if reason := filters.reject(row, motion, self.config, missing):
             return reason
         return row
 
@@ -216,7 +229,7 @@ class Collector:
                 end = min(end, begin - now - 1.0 / self.rate)
         of = row["obstacles.track"]
         ends = np.where(of < 0, np.inf, self._last[of] / self.rate - now)
-        end = min(end, surroundings_end(row, ends))
+        end = min(end, filters.surroundings_end(row, ends))
         if end >= row["future_s"]:
             return None
         if end < self.config.min_surroundings_s:
@@ -362,30 +375,105 @@ class Collector:
         change = (high - low) / span[:, None]
         return {"a": change[:, 3], "l_dot": change[:, 1]}
 
-    def _ghosts(self, frame: LaneFrame, start: int, number: int) -> np.ndarray:
-        """[g, T, 2] station and offset of road users missing from the file."""
-        smooth = self.tracks[number]
+    def _missing(self, frame: LaneFrame, start: int, number: int) -> np.ndarray:
+        """Return station and offset [g, T, 2] of agents missing from the file."""
+        smooth, missing = self.tracks[number], self.recording.missing_agents
+        if frame.chain not in self._missing_views:
+            self._missing_views[frame.chain] = [
+                self._missing_view(frame, agent) for agent in missing
+            ]
         clock = (smooth.first_frame + start) / self.rate + TIMES_S
         s0 = self.view(frame).s[number][start]
-        found = np.empty((len(self.recording.ghosts), TIMES_S.size, 2))
-        for row, (times, s, l) in zip(found, self._ghost_view(frame), strict=True):
+        found = np.empty((len(missing), TIMES_S.size, 2))
+        for row, (times, s, l) in zip(
+            found, self._missing_views[frame.chain], strict=True
+        ):
             row[:, 0] = np.interp(clock, times, s) - s0
             row[:, 1] = np.interp(clock, times, l)
         return found
 
-    def _ghost_view(self, frame: LaneFrame) -> list[tuple[np.ndarray, ...]]:
-        """(times, s, l) of each missing road user in a chain's frame (cached)."""
-        if frame.chain not in self._ghost_views:
-            self._ghost_views[frame.chain] = [
-                self._ghost(frame, ghost) for ghost in self.recording.ghosts
-            ]
-        return self._ghost_views[frame.chain]
-
-    def _ghost(self, frame: LaneFrame, ghost: Ghost) -> tuple[np.ndarray, ...]:
-        count = int((ghost.t1 - ghost.t0) * self.rate) + 2
-        share = np.linspace(0.0, 1.0, min(count, MAX_GHOST_POINTS))
+    def _missing_view(
+        self, frame: LaneFrame, agent: MissingAgent
+    ) -> tuple[np.ndarray, ...]:
+        """Return (times, s, l) of a missing agent in a chain's frame."""
+        count = int((agent.t1 - agent.t0) * self.rate) + 2
+        share = np.linspace(0.0, 1.0, min(count, MAX_MISSING_POINTS))
         x, y = (
             low + share * (high - low)
-            for low, high in zip(ghost.start, ghost.end, strict=True)
+            for low, high in zip(agent.start, agent.end, strict=True)
         )
-        return ghost.t0 + share * (ghost.t1 - ghost.t0), *project(frame, x, y)
+        return agent.t0 + share * (agent.t1 - agent.t0), *project(frame, x, y)
+
+
+# ------------------------------------------------------- rows -> a Demonstration
+
+
+def stack_scenes(rows: list[dict]) -> Scene:
+    """Scenes [n, ...] from flat rows; floats become float32."""
+
+    def leaf(name: str) -> Any:  # noqa: ANN401
+        values = np.array([row[name] for row in rows])
+        return values.astype(np.float32) if values.dtype.kind == "f" else values
+
+    def node(kind: type, prefix: str) -> Any:  # noqa: ANN401
+        names = kind.__dataclass_fields__
+        return kind(**{name: leaf(f"{prefix}.{name}") for name in names})
+
+    return Scene(
+        ego=node(Ego, "ego"),
+        path=node(Path, "path"),
+        obstacles=node(Obstacles, "obstacles"),
+        time_valid=leaf("time_valid"),
+        tags=leaf("tags"),
+    )
+
+
+@functools.cache
+def _complete() -> jax.stages.Wrapped:
+    return jax.jit(jax.vmap(trajectory_from_positions))
+
+
+def human_trajectories(scene: Scene, s: np.ndarray, l: np.ndarray) -> Trajectory:
+    """The humans' Trajectories [n, T] through the operator shared with candidates."""
+    count = s.shape[0]
+    parts = []
+    for start in range(0, count, CHUNK):
+        index = np.minimum(np.arange(start, start + CHUNK), count - 1)
+        chunk = jax.tree.map(lambda x, index=index: x[index], scene)
+        full = _complete()(chunk, s[index], l[index])
+        keep = min(CHUNK, count - start)
+        parts.append(jax.tree.map(lambda x, keep=keep: np.asarray(x)[:keep], full))
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def assemble(
+    rows: list[dict], *, vehicles: list[int], groups: list[int], recording: int
+) -> Demonstration:
+    """One batched Demonstration of a recording's rows.
+
+    Args:
+      rows: at least one row as made by `collect.Collector`.
+      vehicles: number of the ego's vehicle inside the dataset, per row.
+      groups: number of the vehicle-disjoint group, per row.
+      recording: number of the recording inside the dataset.
+
+    Returns:
+      Demonstration with numpy leaves [n, ...].
+    """
+    scene = stack_scenes(rows)
+    s = np.array([row["human.s"] for row in rows], np.float32)
+    l = np.array([row["human.l"] for row in rows], np.float32)
+    leaves: dict[str, Any] = {
+        "decisions": np.array([row["decisions"] for row in rows], np.int32),
+        "future_s": np.array([row["future_s"] for row in rows], np.float32),
+        "s_at_5s": np.array([row["s_at_5s"] for row in rows], np.float32),
+        "vehicle": np.array(vehicles, np.int32),
+        "recording": np.full(len(rows), recording, np.int32),
+        "group": np.array(groups, np.int32),
+        "frame": np.array([row["frame"] for row in rows], np.int32),
+    }
+    return Demonstration(
+        scene=scene,
+        human=human_trajectories(scene, s, l),
+        **leaves,
+    )

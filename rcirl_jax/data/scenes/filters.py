@@ -1,11 +1,22 @@
-"""Which scenes are kept: each reason to drop one has a name and is counted."""
+"""Which scenes are kept, and until when: each reason to drop one is counted.
+
+A lead vehicle that leaves the recorded region, or whose track ends, is not recorded
+from then on, but the human still reacts to it. What the human does then cannot be
+learned from the recording, so the scene's mask ends there.
+"""
 
 import numpy as np
 
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.scenes.motion import Motion
+from rcirl_jax.data.scenes.manoeuvres import (
+    LATERAL_BUFFER_M,
+    MOVING_MPS,
+    NUDGE_RANGE_M,
+    NUDGE_SPEED_MPS,
+)
+from rcirl_jax.data.scenes.motion import GRID_M, Motion
 from rcirl_jax.types import Kind
-from rcirl_jax.units import DT_S
+from rcirl_jax.units import DT_S, NUM_TIMES, TIMES_S
 
 REASONS = {
     "future_too_short": "the track ends before the minimum future (per track)",
@@ -40,10 +51,12 @@ MAX_JERK_MPS3 = 15.0  # m/s^3
 OFF_ROAD_M = 1.0  # m beyond the drivable area's edge
 OVERLAP_M = 0.3  # m of penetration taken as more than noise
 SAME_LANE_M = 2.0  # m of lateral difference within which one follows
+EARLY_S = 1e-6  # s, by which two times of one sample may differ
+SAME_PLACE_M = 2.0  # m, within which a track that begins goes on for one that ended
 
 
 def reject_motion(row: dict, motion: Motion, config: CollectConfig) -> str | None:
-    """The first reason to drop a scene for how its human drives, or None.
+    """Return the first reason to drop a scene for how its human drives, or None.
 
     Asked before anybody else is looked at: where traffic flows this drops most.
 
@@ -53,63 +66,38 @@ def reject_motion(row: dict, motion: Motion, config: CollectConfig) -> str | Non
       config: which filters are on.
     """
     valid = row["time_valid"]
-    if _far_from_road(row, motion, valid):
+    left = np.interp(motion.s, GRID_M, row["path.road_left"])
+    right = np.interp(motion.s, GRID_M, row["path.road_right"])
+    out = (motion.l > left + OFF_ROAD_M) | (motion.l < right - OFF_ROAD_M)
+    if np.any(out & valid):
         return "far_from_road"
-    if _too_noisy(motion, valid):
+    speeds = np.diff(motion.s)[valid[1:]] / DT_S
+    a = np.diff(speeds) / DT_S
+    if (
+        np.any(np.abs(a) > MAX_ACCELERATION_MPS2)
+        or np.any(np.abs(np.diff(a) / DT_S) > MAX_JERK_MPS3)
+        or abs(motion.a0) > MAX_ACCELERATION_MPS2
+    ):
         return "too_noisy"
-    if config.require_speed_change and _keeps_speed(motion, valid):
+    change = np.ptp(np.append(speeds, motion.v0))
+    if config.require_speed_change and change < MIN_SPEED_CHANGE_MPS:
         return "no_speed_change"
     return None
 
 
 def reject(
-    row: dict, motion: Motion, config: CollectConfig, ghosts: np.ndarray
+    row: dict, motion: Motion, config: CollectConfig, missing: np.ndarray
 ) -> str | None:
-    """The first reason to drop a scene for who else is there, or None.
+    """Return the first reason to drop a scene for who else is there, or None.
 
     Args:
       row: the scene's flat arrays.
       motion: the human's motion, kept by `reject_motion`.
       config: which filters are on.
-      ghosts: [g, T, 2] station and offset of cars missing from the file.
+      missing: [g, T, 2] station and offset of agents missing from the file.
     """
     if config.require_obstacles and row["num_bodies"] == 0:
         return "no_obstacles"
-    if _overlaps(row, motion, row["time_valid"]):
-        return "overlapping_boxes"
-    if follows_ghost(row, motion, ghosts):
-        return "follows_missing_car"
-    return None
-
-
-def _far_from_road(row: dict, motion: Motion, valid: np.ndarray) -> bool:
-    grid = np.arange(row["path.road_left"].size) * 2.0
-    left = np.interp(motion.s, grid, row["path.road_left"])
-    right = np.interp(motion.s, grid, row["path.road_right"])
-    out = (motion.l > left + OFF_ROAD_M) | (motion.l < right - OFF_ROAD_M)
-    return bool(np.any(out & valid))
-
-
-def _speeds(motion: Motion, valid: np.ndarray) -> np.ndarray:
-    return np.diff(motion.s)[valid[1:]] / DT_S
-
-
-def _keeps_speed(motion: Motion, valid: np.ndarray) -> bool:
-    speeds = np.append(_speeds(motion, valid), motion.v0)
-    return bool(np.ptp(speeds) < MIN_SPEED_CHANGE_MPS)
-
-
-def _too_noisy(motion: Motion, valid: np.ndarray) -> bool:
-    a = np.diff(_speeds(motion, valid)) / DT_S
-    j = np.diff(a) / DT_S
-    return bool(
-        np.any(np.abs(a) > MAX_ACCELERATION_MPS2)
-        or np.any(np.abs(j) > MAX_JERK_MPS3)
-        or abs(motion.a0) > MAX_ACCELERATION_MPS2
-    )
-
-
-def _overlaps(row: dict, motion: Motion, valid: np.ndarray) -> bool:
     half_length, half_width = 0.5 * row["ego.length"], 0.5 * row["ego.width"]
     gap = np.maximum(
         row["obstacles.s_lower"] - motion.s - half_length,
@@ -121,15 +109,18 @@ def _overlaps(row: dict, motion: Motion, valid: np.ndarray) -> bool:
     )
     kind = row["obstacles.kind"][:, None]
     body = row["obstacles.valid"] & (kind >= Kind.VEHICLE) & (kind <= Kind.STATIC)
-    depth = np.maximum(gap, lateral)
-    return bool(np.any(body & valid & (depth < -OVERLAP_M)))
+    if np.any(body & row["time_valid"] & (np.maximum(gap, lateral) < -OVERLAP_M)):
+        return "overlapping_boxes"
+    if follows_missing_agent(row, motion, missing):
+        return "follows_missing_car"
+    return None
 
 
-def follows_ghost(row: dict, motion: Motion, ghosts: np.ndarray) -> bool:
-    """Whether a missing car drives in the ego's lane with nobody in between."""
-    for ghost in ghosts:
-        ahead = (ghost[:, 0] > motion.s) & (
-            np.abs(ghost[:, 1] - motion.l) < SAME_LANE_M
+def follows_missing_agent(row: dict, motion: Motion, missing: np.ndarray) -> bool:
+    """Return whether a missing agent drives in the ego's lane, nobody in between."""
+    for agent in missing:
+        ahead = (agent[:, 0] > motion.s) & (
+            np.abs(agent[:, 1] - motion.l) < SAME_LANE_M
         )
         if not ahead[: ahead.size // 2].any():
             continue
@@ -138,9 +129,94 @@ def follows_ghost(row: dict, motion: Motion, ghosts: np.ndarray) -> bool:
         between = (
             row["obstacles.valid"]
             & (middle > motion.s)
-            & (middle < ghost[:, 0])
+            & (middle < agent[:, 0])
             & (np.abs(lateral - motion.l) < SAME_LANE_M)
         ).any(axis=0)
         if np.any(ahead & ~between & row["time_valid"]):
             return True
     return False
+
+
+# ----------------------------------------------------------------- surroundings
+
+
+def surroundings_end(row: dict, ends: np.ndarray) -> float:
+    """Return when the first road user that the human reacts to leaves the record.
+
+    At the end of its track it matters if it is the nearest one ahead on the human's
+    own path, or one beside it that the human is about to pass (`labels`: nudge).
+    Road users that were passed, left the path or are hidden by a nearer one do not
+    count, nor does a track that another one continues in the same place.
+
+    Args:
+      row: the scene's flat arrays, without labels.
+      ends: [N] s after the planning frame, end of the track in each slot; inf where
+        there is none.
+
+    Returns:
+      Seconds after the planning frame; inf if the surroundings outlast the human.
+    """
+    for slot in np.argsort(ends, kind="stable").tolist():
+        end = float(ends[slot])
+        if end >= row["future_s"] - EARLY_S:
+            break
+        if _matters(row, slot, end):
+            return end
+    return np.inf
+
+
+def _matters(row: dict, slot: int, end: float) -> bool:
+    """Return whether the human reacts to the road user whose track ends; see above.
+
+    Judged at the next time of the axis: until then it drives on at its last speed.
+    """
+    now = int(np.searchsorted(TIMES_S, end + EARLY_S))
+    valid = row["obstacles.valid"]
+    if now in (0, NUM_TIMES) or not valid[slot, now - 1]:
+        return False
+    boxes = {
+        name: row[f"obstacles.{name}"][:, now].copy()
+        for name in ("s_lower", "s_upper", "l_lower", "l_upper", "speed")
+    }
+    speed = boxes["speed"][slot]
+    for name in ("s_lower", "s_upper"):
+        boxes[name][slot] += speed * (TIMES_S[now] - end)
+    kind = row["obstacles.kind"]
+    there = valid[:, now] & (kind >= Kind.VEHICLE) & (kind <= Kind.STATIC)
+    there[slot] = False
+    if (there & _same_place(boxes, slot)).any():
+        return False
+    there[slot] = True
+    middle = 0.5 * (boxes["s_lower"] + boxes["s_upper"])
+    path_l = np.interp(middle, GRID_M, row["path.l"])
+    aside = np.maximum(boxes["l_lower"] - path_l, path_l - boxes["l_upper"])
+    aside -= 0.5 * row["ego.width"]
+    on_path = there & (aside < LATERAL_BUFFER_M) & (middle > row["human.s"][now])
+    if on_path[slot]:
+        return slot == int(np.argmin(np.where(on_path, boxes["s_lower"], np.inf)))
+    is_beside = LATERAL_BUFFER_M <= aside[slot] < NUDGE_RANGE_M
+    return bool(is_beside) and _is_passed(row, boxes, slot, now)
+
+
+def _same_place(boxes: dict, slot: int) -> np.ndarray:
+    """Return [N] bool: boxes about where the one in a slot is."""
+    near = np.ones(boxes["speed"].shape, bool)
+    for axis in ("s", "l"):
+        lower, upper = boxes[f"{axis}_lower"], boxes[f"{axis}_upper"]
+        middle = 0.5 * (lower + upper)
+        near &= np.abs(middle - middle[slot]) < SAME_PLACE_M
+    return near
+
+
+def _is_passed(row: dict, boxes: dict, slot: int, now: int) -> bool:
+    """Return whether the human passes a slower one, at its speed, from `now` on."""
+    human, times = row["human.s"][now:], TIMES_S[now:]
+    half, speed = 0.5 * row["ego.length"], boxes["speed"][slot]
+    if human.size < 2 or speed < -MOVING_MPS:
+        return False
+    drives_off = speed * (times - times[0])
+    alongside = (human + half > boxes["s_lower"][slot] + drives_off) & (
+        human - half < boxes["s_upper"][slot] + drives_off
+    )
+    faster = np.gradient(human, times) - speed > NUDGE_SPEED_MPS
+    return bool(np.any(alongside & faster & (times <= row["future_s"] + EARLY_S)))

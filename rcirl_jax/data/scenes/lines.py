@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rcirl_jax.data.scenes.config import SignalChecks
 from rcirl_jax.data.scenes.lanes import LaneFrame, project
 from rcirl_jax.data.scenes.motion import Motion
-from rcirl_jax.data.scenes.signal_checks import SignalChecks
 from rcirl_jax.types import Kind, Recording, Signal, Track
 from rcirl_jax.units import EGO_LENGTH_M, LINE_HALF_WIDTH_M, TIMES_S
 

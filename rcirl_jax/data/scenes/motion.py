@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from rcirl_jax.data.scenes.smoothing import savgol
+from rcirl_jax.data.scenes.tracks import savgol
 from rcirl_jax.units import HORIZON_S, NUM_STATIONS, STATION_STEP_M, TIMES_S
 
 GRID_M = np.arange(NUM_STATIONS) * STATION_STEP_M  # [P] m, the station grid

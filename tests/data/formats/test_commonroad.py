@@ -201,9 +201,9 @@ ON_LANELET = '<position><lanelet ref="1"/></position>'
     [(RECTANGLE, (25.0, 1.0)), (ON_LANELET, (30.0, 0.0)), ("", (30.0, 0.0))],
 )
 def test_ghost_reaches_the_goal(tmp_path, goal, end):
-    (ghost,) = scenario(tmp_path, road(), w.problem(goal, speed=10.0)).ghosts
-    assert (ghost.t0, ghost.t1, ghost.start) == (0.0, pytest.approx(3.0), (0.0, 0.0))
-    np.testing.assert_allclose(ghost.end, end, atol=0.6)
+    (agent,) = scenario(tmp_path, road(), w.problem(goal, speed=10.0)).missing_agents
+    assert (agent.t0, agent.t1, agent.start) == (0.0, pytest.approx(3.0), (0.0, 0.0))
+    np.testing.assert_allclose(agent.end, end, atol=0.6)
 
 
 def test_groups_beside_and_above_the_folder(tmp_path):
@@ -241,9 +241,9 @@ def test_recorded_files(data_dir, folder, files, tracks, groups):
     assert sum(len(recording.tracks) for recording in found) == tracks
     assert len({recording.group for recording in found}) == groups
     for recording in found:
-        (ghost,) = recording.ghosts
-        distance = np.hypot(*np.subtract(ghost.end, ghost.start))
-        assert distance / (ghost.t1 - ghost.t0) < 25.0  # m/s, no car flies
+        (agent,) = recording.missing_agents
+        distance = np.hypot(*np.subtract(agent.end, agent.start))
+        assert distance / (agent.t1 - agent.t0) < 25.0  # m/s, no car flies
     if "us101" in folder:  # cars stay on the lanes
         for recording in found[:3]:
             centres = np.concatenate([lane.centre for lane in recording.lanes])

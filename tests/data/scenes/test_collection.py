@@ -9,17 +9,25 @@ import pytest
 from rcirl_jax.data.importing import digest
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.recording import validate_recording
-from rcirl_jax.data.scenes.assemble import assemble
-from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.collect import Collector, assemble
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.scenes.filters import REASONS
 from rcirl_jax.data.scenes.labels import labels_of
 from rcirl_jax.data.scenes.lanes import LaneGraph
 from rcirl_jax.data.scenes.lines import CREEP_M
 from rcirl_jax.data.scenes.motion import FrameTracks, driver_of, given_path
-from rcirl_jax.data.scenes.smoothing import harsh_share, savgol
+from rcirl_jax.data.scenes.tracks import harsh_share, savgol
 from rcirl_jax.sampling import trajectory_from_positions
-from rcirl_jax.types import Decision, Ghost, Kind, Lane, Recording, Signal, Tag, Track
+from rcirl_jax.types import (
+    Decision,
+    Kind,
+    Lane,
+    MissingAgent,
+    Recording,
+    Signal,
+    Tag,
+    Track,
+)
 from rcirl_jax.units import TIMES_S
 from tests.helpers.logs import refused
 from tests.helpers.roads import (
@@ -283,7 +291,7 @@ def hard():
     jerky = car("ego", lambda t: 20 + 12 * t + 4.0 * np.sin(2 * t))
     leaves = car("ego", speeding_up(20.0), y=lambda t: 9.0 * smooth_step(t, 1, 5))
     by_machine = dataclasses.replace(ego, automated=((5.0, 12.0),))
-    ghost = Ghost(t0=0.0, t1=10.0, start=(45.0, 0.0), end=(190.0, 0.0))
+    ghost = MissingAgent(t0=0.0, t1=10.0, start=(45.0, 0.0), end=(190.0, 0.0))
     short = car("lead", speeding_up(60.0), seconds=2.0)
     return {
         "future_too_short": recording(car("ego", speeding_up(20.0), seconds=3.0)),
@@ -294,7 +302,7 @@ def hard():
         "no_speed_change": recording(steady, lead),
         "too_noisy": recording(jerky, lead),
         "overlapping_boxes": recording(ego, car("twin", speeding_up(22.0))),
-        "follows_missing_car": recording(ego, lead, ghosts=(ghost,)),
+        "follows_missing_car": recording(ego, lead, missing_agents=(ghost,)),
         "surroundings_end": recording(ego, short),
     }
 

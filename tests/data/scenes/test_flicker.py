@@ -8,7 +8,7 @@ import pytest
 from rcirl_jax.data.quality import QualityReport, format_quality
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.scenes.flicker import JOINED, SHORT, SMALL, joined, steady_tracks
+from rcirl_jax.data.scenes.tracks import JOINED, SHORT, SMALL, joined, steady_tracks
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 from tests.helpers.roads import NO_FILTER, SERIES, WIDTH, car, recording, speeding_up

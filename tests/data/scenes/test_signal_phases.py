@@ -7,9 +7,8 @@ from rcirl_jax.cli.flags import pooled_signals
 from rcirl_jax.data.inputs import input_files, recordings_of
 from rcirl_jax.data.scenes import signal_phases
 from rcirl_jax.data.scenes.collect import Collector
-from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.scenes.config import CollectConfig, SignalChecks, signal_checks
 from rcirl_jax.data.scenes.lines import trusted_signals
-from rcirl_jax.data.scenes.signal_checks import SignalChecks, signal_checks
 from rcirl_jax.data.scenes.signal_phases import (
     check_events,
     check_written,

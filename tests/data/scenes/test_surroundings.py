@@ -8,8 +8,7 @@ import pytest
 from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.recording import validate_recording
-from rcirl_jax.data.scenes.assemble import assemble
-from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.collect import Collector, assemble
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.types import Decision
 from rcirl_jax.units import TIMES_S

@@ -2,7 +2,7 @@
 
 The XML is parsed with entities, DTDs and external references forbidden. Every
 obstacle becomes a Track, every lanelet a Lane, every traffic light a Signal of
-the schedule written in the file, every planning problem a Ghost (the converter
+the schedule written in the file, every planning problem a MissingAgent (the converter
 removed that car from the traffic).
 """
 
@@ -22,7 +22,7 @@ from rcirl_jax.data.formats.tracks import of_one_name
 from rcirl_jax.data.readers.xml import Fields, read_xml
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Ghost, Kind, Recording, Signal, Track
+from rcirl_jax.types import Kind, MissingAgent, Recording, Signal, Track
 
 VERSIONS = ("2018b", "2020a")
 GROUPS_UP = 4  # folders above a file in which the table of groups is looked for
@@ -150,7 +150,7 @@ def _read_file(path: Path, spec: dict, groups: dict[str, str]) -> Recording:
         tracks=tuple(tracks),
         lanes=lanes,
         signals=tuple(_signals(root, fields, dt, last)),
-        ghosts=tuple(_ghosts(root, fields, dt, centres)),
+        missing_agents=tuple(_missing_agents(root, fields, dt, centres)),
         group=group,
         # of lanes without one: the median of the file's, if any
         default_speed_limit=float(np.median(limits)) if limits else usual,
@@ -374,9 +374,9 @@ def _signals(root: Element, fields: Fields, dt: float, last: float) -> Iterator[
         )
 
 
-def _ghosts(
+def _missing_agents(
     root: Element, fields: Fields, dt: float, lanes: dict[str, np.ndarray]
-) -> Iterator[Ghost]:
+) -> Iterator[MissingAgent]:
     """Every planning problem's car, which the converter took out of the traffic."""
     for problem in root.iterfind("planningProblem"):
         where = f"planningProblem {problem.get('id', '(no id)')}"
@@ -393,7 +393,9 @@ def _ghosts(
         heading = fields.scalar(initial, "orientation", where)
         ahead = speed * (t1 - t0) * np.array([np.cos(heading), np.sin(heading)])
         end = _goal_point(goal, fields, where, np.array(start) + ahead, lanes)
-        yield Ghost(t0=t0, t1=t1, start=start, end=(float(end[0]), float(end[1])))
+        yield MissingAgent(
+            t0=t0, t1=t1, start=start, end=(float(end[0]), float(end[1]))
+        )
 
 
 def _goal_point(

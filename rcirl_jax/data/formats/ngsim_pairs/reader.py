@@ -10,7 +10,7 @@ Traps: files share vehicles and some hold the same pair twice (run, follower and
 leader stand in the file name ..._fF_lL_NNNNN.csv), so pairs that share a vehicle
 are one group; the follower's own length is known only where it leads in another
 file; there is no lateral position and no lane; whom the leader follows is not in
-the file (a Ghost ahead says so, and its scenes are dropped).
+the file (a MissingAgent ahead says so, and its scenes are dropped).
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ from rcirl_jax.data.readers.tables.ledger import LINE, with_news
 from rcirl_jax.data.readers.tables.table import open_table
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Ghost, Kind, Recording, Track
+from rcirl_jax.types import Kind, MissingAgent, Recording, Track
 
 TABLE = Columns(
     needed={
@@ -160,7 +160,7 @@ def _recording(
         lanes=straight_lanes(path, [lane], width, limit),
         group=group,
         # somebody ahead of both cars all the time
-        ghosts=(Ghost(t0=0.0, t1=last, start=end, end=end),),
+        missing_agents=(MissingAgent(t0=0.0, t1=last, start=end, end=end),),
         default_speed_limit=limit,
         notes=tuple(notes),
     )
