@@ -1,7 +1,7 @@
 """The data-quality report of an import: counts, noise, headways, labels, drops."""
 
-import collections
 import dataclasses
+from collections import Counter
 from collections.abc import Mapping
 
 import numpy as np
@@ -40,34 +40,22 @@ class QualityReport:
     shortened: int = 0  # scenes that end with their surroundings
     times: int = 0  # points of the time axis inside the scenes' recorded futures
     times_cut: int = 0  # of them after the surroundings' end
-    dropped: collections.Counter = dataclasses.field(
-        default_factory=collections.Counter
-    )
-    tags: collections.Counter = dataclasses.field(default_factory=collections.Counter)
-    decisions: collections.Counter = dataclasses.field(
-        default_factory=collections.Counter
-    )
+    dropped: Counter = dataclasses.field(default_factory=Counter)
+    tags: Counter = dataclasses.field(default_factory=Counter)
+    decisions: Counter = dataclasses.field(default_factory=Counter)
     # how often each multiple of a step was met; the key is the multiple as text
-    headways: collections.Counter = dataclasses.field(
-        default_factory=collections.Counter
-    )
-    speeds: collections.Counter = dataclasses.field(default_factory=collections.Counter)
-    futures: collections.Counter = dataclasses.field(
-        default_factory=collections.Counter
-    )
-    # of tables: rows read, and those dropped by why
-    rows: collections.Counter = dataclasses.field(default_factory=collections.Counter)
-    # tracks that were joined or left out, by why
-    flicker: collections.Counter = dataclasses.field(
-        default_factory=collections.Counter
-    )
+    headways: Counter = dataclasses.field(default_factory=Counter)
+    speeds: Counter = dataclasses.field(default_factory=Counter)
+    futures: Counter = dataclasses.field(default_factory=Counter)
+    # of tables: rows read, and dropped by why
+    rows: Counter = dataclasses.field(default_factory=Counter)
+    # tracks joined or left out, by why
+    flicker: Counter = dataclasses.field(default_factory=Counter)
     notes: list[str] = dataclasses.field(default_factory=list)
     refused: int = 0  # recordings left out
     empty: int = 0  # recordings without traffic
     # lanes without a speed limit or width, road users without a size, and all of them
-    assumed: collections.Counter = dataclasses.field(
-        default_factory=collections.Counter
-    )
+    assumed: Counter = dataclasses.field(default_factory=Counter)
 
     def add_refusal(self, recording: Recording) -> None:
         """Count a recording that is left out, and note why."""
@@ -80,18 +68,6 @@ class QualityReport:
         self.notes += [
             f"{recording.name}: {x}" for x in ("no traffic", *recording.notes)
         ]
-
-    def _add_assumed(self, recording: Recording) -> None:
-        """Count what the log does not say and is guessed; note it of each recording."""
-        found = assumed(recording)
-        self.assumed.update(found)
-        self.assumed["lanes"] += len(recording.lanes)
-        self.assumed["road users"] += len(recording.tracks)
-        words = ", ".join(f"{count} {what}" for what, count in found.items() if count)
-        if words:
-            limit = f"speed limit {recording.default_speed_limit:.2f} m/s"
-            words = words.replace("speed limit", limit)
-            self.notes.append(f"{recording.name}: assumed: {words}")
 
     def add_recording(self, collector: Collector) -> None:
         """Count a recording's tracks, noise, drop reasons and notes."""
@@ -116,7 +92,15 @@ class QualityReport:
         self.shortened += collector.ended["shortened"]
         self.times += collector.ended["times"]
         self.times_cut += collector.ended["times_cut"]
-        self._add_assumed(recording)
+        found = assumed(recording)
+        self.assumed.update(found)
+        self.assumed["lanes"] += len(recording.lanes)
+        self.assumed["road users"] += len(recording.tracks)
+        words = ", ".join(f"{count} {what}" for what, count in found.items() if count)
+        if words:
+            limit = f"{LIMIT} {recording.default_speed_limit:.2f} m/s"
+            words = words.replace(LIMIT, limit)
+            self.notes.append(f"{recording.name}: assumed: {words}")
         notes = [*recording.notes, *collector.signal_notes]
         self.notes += [f"{recording.name}: {note}" for note in notes]
 
@@ -138,13 +122,10 @@ class QualityReport:
         ):
             counts.update(map(str, np.round(values / step).astype(int).tolist()))
 
-    def _any_assumed(self) -> bool:
-        return any(self.assumed[what] for what in (LIMIT, WIDTH, SIZE))
-
     def state(self) -> dict:
         """All sums and lists, JSON-ready; `merge` takes it back."""
         return {
-            name: dict(found) if isinstance(found, collections.Counter) else found
+            name: dict(found) if isinstance(found, Counter) else found
             for name, found in vars(self).items()
         }
 
@@ -152,7 +133,7 @@ class QualityReport:
         """Add another report's `state()`."""
         for name, found in state.items():
             mine = getattr(self, name)
-            if isinstance(mine, collections.Counter):
+            if isinstance(mine, Counter):
                 mine.update(found)
             elif isinstance(mine, list):
                 mine.extend(found)
@@ -162,6 +143,7 @@ class QualityReport:
     def as_dict(self) -> dict:
         """JSON-ready summary."""
         total = max(self.accelerations, 1)
+        is_assumed = any(self.assumed[what] for what in (LIMIT, WIDTH, SIZE))
         return {
             "recordings": self.recordings,
             "tracks": self.tracks,
@@ -184,7 +166,7 @@ class QualityReport:
             **({"flicker": dict(self.flicker)} if self.flicker else {}),
             **({"refused": self.refused} if self.refused else {}),
             **({"empty": self.empty} if self.empty else {}),
-            **({"assumed": dict(self.assumed)} if self._any_assumed() else {}),
+            **({"assumed": dict(self.assumed)} if is_assumed else {}),
             "notes": self.notes[:200],
             "num_notes": len(self.notes),
         }
@@ -233,14 +215,14 @@ def _headways(demonstrations: Demonstration) -> np.ndarray:
     return headway[np.isfinite(headway)]
 
 
-def _sorted(counts: collections.Counter, step: float) -> tuple[np.ndarray, np.ndarray]:
+def _sorted(counts: Counter, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Values in ascending order, and how often each was met."""
     pairs = sorted((int(key), count) for key, count in counts.items())
     keys, times = np.array(pairs, float).reshape(-1, 2).T
     return keys * step, times
 
 
-def _quantiles(counts: collections.Counter, step: float) -> dict | None:
+def _quantiles(counts: Counter, step: float) -> dict | None:
     """5, 50 and 95 % points, to half a step; None of nothing."""
     if not counts:
         return None
@@ -250,7 +232,7 @@ def _quantiles(counts: collections.Counter, step: float) -> dict | None:
     return dict(zip(("p05", "p50", "p95"), found.tolist(), strict=True))
 
 
-def _histogram(counts: collections.Counter, step: float) -> dict[str, int]:
+def _histogram(counts: Counter, step: float) -> dict[str, int]:
     edges = (0.0, *HEADWAY_EDGES_S, np.inf)
     values, times = _sorted(counts, step)
     found = np.histogram(values, edges, weights=times)[0]

@@ -6,15 +6,17 @@ file, the field, the value found and what was expected.
 """
 
 import dataclasses
-from collections.abc import Callable
+import itertools
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.motion_checks import check_against_motion
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.runtime.atomic_files import is_text
 from rcirl_jax.types import Kind, Lane, MissingAgent, Recording, Signal, Track
+from rcirl_jax.units import FOOT_M, MPH_MPS
 
 # keys that an import adds to a spec
 LEAVE_OUT = "leave_out"  # refused recordings are left out
@@ -29,12 +31,45 @@ STATIC_RANGE_M = (0.01, 1000.0)  # m, standing objects: from posts to long walls
 RATE_TOLERANCE = 0.12  # relative; timestamps rounded to 10 ms at 30 Hz pass
 SERIES = ("t", "x", "y", "heading", "speed")
 STATES = ("red", "yellow", "green", "off")
+# vehicles needed to judge; two lorries, or one that reverses, are no error
+MIN_CARS = 3
+# m, of the median vehicle: below it lengths were taken for feet; above it they are in
+# feet, if those of a quarter from the shortest are too (a car is 4-5 m, a bus 12)
+MEDIAN_CAR_M = (2.0, 9.0)
+WIDEST_IN_LANE = 1.0  # median vehicle's width over the median lane's
+MOVING_MPS = 2.0  # m/s, speeds and headings are compared only above this
+WINDOW_S = 0.5  # s, position noise averages out over it
+SPEED_RATIO_RANGE = (0.5, 2.0)  # recorded speed over speed from positions
+MIN_MOVING_SAMPLES = 10  # samples needed to judge speeds and headings
+# what a ratio near one of these means (recorded speed over that of positions)
+RATIO_HINTS = {
+    FOOT_M: "feet taken for metres?",
+    1.0 / FOOT_M: "feet taken for metres?",
+    3.6: "km/h taken for m/s?",
+    1.0 / MPH_MPS: "mph taken for m/s?",
+}
+HINT_TOLERANCE = 0.08  # relative; 3.28 and 3.6 stay apart
+HEADING_FITS = math.radians(15.0)  # rad from the direction of travel, in the median
+HEADING_FITS_WELL = math.radians(8.0)  # rad, of a convention that is named as the cause
+# how an angle in a file may become a heading: sign * unit * angle + zero [rad]
+DIRECTIONS = (
+    ("counter-clockwise from +x", 1.0, 0.0),
+    ("clockwise from north (a compass)", -1.0, 0.5 * math.pi),
+    ("clockwise from +x", -1.0, 0.0),
+    ("counter-clockwise from north", 1.0, 0.5 * math.pi),
+    ("counter-clockwise from -x (half a turn off)", 1.0, math.pi),
+)
+UNITS = (
+    ("radians", 1.0),
+    ("degrees", math.pi / 180.0),
+    ("radians, converted as if they were degrees", 180.0 / math.pi),
+)
 
 
 def accepted(
     make: Callable[[], Recording], name: str, file: object, spec: dict
 ) -> Recording:
-    """A validated recording of several in one file.
+    """Return a validated recording of several in one file.
 
     Args:
       make: reads it.
@@ -56,12 +91,12 @@ def accepted(
 
 
 def refusal(name: str, error: InputError) -> Recording:
-    """What stands for a recording that is left out."""
+    """Return what stands for a recording that is left out."""
     return dataclasses.replace(empty_recording(name), refused=str(error))
 
 
 def empty_recording(name: str, *notes: str) -> Recording:
-    """What stands for a file in which nobody drives; imports count and skip it."""
+    """Return what stands for a file in which nobody drives; imports skip it."""
     return Recording(
         name=name, source="", licence="", rate_hz=0.0, tracks=(), lanes=(), notes=notes
     )
@@ -70,7 +105,7 @@ def empty_recording(name: str, *notes: str) -> Recording:
 def validate_recording(
     recording: Recording, file: str | Path | None = None
 ) -> Recording:
-    """The recording with references to unknown lanes and signals dropped.
+    """Check a recording; references to unknown lanes and signals are dropped.
 
     One without traffic is no error: an import counts and skips it.
 
@@ -106,7 +141,7 @@ def validate_recording(
     signals = {signal.id for signal in recording.signals}
     checked = [_check_lane(name, lane, lanes, signals) for lane in recording.lanes]
     _check_places(name, recording)
-    check_against_motion(name, recording)
+    _check_against_motion(name, recording)
     return dataclasses.replace(recording, lanes=tuple(checked))
 
 
@@ -283,4 +318,120 @@ def _check_lane(name: str, lane: Lane, lanes: set[str], signals: set[str]) -> La
         left=lane.left if lane.left in lanes else None,
         right=lane.right if lane.right in lanes else None,
         signal_ids=tuple(s for s in lane.signal_ids if s in signals),
+    )
+
+
+# --------------------------------------------------------- against the motion
+
+
+def _check_against_motion(name: str, recording: Recording) -> None:
+    """Check sizes, speeds and headings against positions and lanes.
+
+    Positions are rarely wrong. What contradicts them is refused, and the likely cause
+    is named. A recording with few moving road users is not judged.
+    """
+    cars = [track for track in recording.tracks if track.kind == Kind.VEHICLE]
+    if len(cars) >= MIN_CARS:
+        _check_sizes(name, cars, recording.lanes)
+    _check_speeds(name, recording)
+    if len(cars) >= MIN_CARS:
+        _check_headings(name, cars, recording.rate_hz)
+
+
+def _check_sizes(name: str, cars: Sequence[Track], lanes: Sequence[Lane]) -> None:
+    """Check the median vehicle: as long as a car, narrower than its lane."""
+    lengths = [track.length for track in cars]
+    length = float(np.median(lengths))
+    width = float(np.median([track.width for track in cars]))
+    low, high = MEDIAN_CAR_M
+    if length < low or min(length, float(np.quantile(lengths, 0.25))) > high:
+        wrong = "feet taken for metres" if length > high else "metres taken for feet"
+        raise InputError(
+            f"{name}: length: median {length:.1f} m: "
+            f"expected {low:g} to {high:g} m; {wrong}?"
+        )
+    if width > length:
+        raise InputError(
+            f"{name}: width: median {width:.2f} m, of length {length:.2f} m: expected "
+            "vehicles longer than wide; are the two columns exchanged?"
+        )
+    room = [float(np.median(lane.left_width + lane.right_width)) for lane in lanes]
+    lane_width = float(np.median(room)) if room else math.inf
+    if width > WIDEST_IN_LANE * lane_width:
+        raise InputError(
+            f"{name}: width: median {width:.2f} m, of lanes {lane_width:.2f} m: "
+            "expected vehicles narrower than their lanes; feet taken for metres, or "
+            "half the width of a lane given as the whole?"
+        )
+
+
+def _windows(track: Track, rate_hz: float) -> tuple[int, np.ndarray, np.ndarray]:
+    """Return samples in a window; of each, displacement [m, 2] m and duration [m] s."""
+    span = min(max(round(WINDOW_S * rate_hz), 1), track.t.size - 1)
+    if span < 1:
+        return 0, np.zeros((0, 2)), np.zeros(0)
+    place = np.stack([track.x, track.y], axis=-1)
+    return span, place[span:] - place[:-span], track.t[span:] - track.t[:-span]
+
+
+def _speed_ratios(track: Track, rate_hz: float) -> np.ndarray:
+    """Return recorded speed over speed from positions, in windows where it moves.
+
+    ratio = integral of |speed| dt / distance between the window's ends
+    """
+    span, moved, lasted = _windows(track, rate_hz)
+    if not span:
+        return np.zeros(0)
+    speed = np.abs(track.speed)
+    mean = 0.5 * (speed[1:] + speed[:-1])
+    path = np.concatenate([[0.0], np.cumsum(mean * np.diff(track.t))])
+    recorded, distance = path[span:] - path[:-span], np.hypot(*moved.T)
+    moving = np.maximum(recorded, distance) > MOVING_MPS * lasted
+    return recorded[moving] / np.maximum(distance[moving], 1e-9)
+
+
+def _check_speeds(name: str, recording: Recording) -> None:
+    moving = [track for track in recording.tracks if track.kind != Kind.STATIC]
+    found = [_speed_ratios(track, recording.rate_hz) for track in moving]
+    ratios = np.concatenate([np.zeros(0), *found])
+    if ratios.size < MIN_MOVING_SAMPLES:
+        return
+    ratio = float(np.median(ratios))
+    low, high = SPEED_RATIO_RANGE
+    if not low <= ratio <= high:
+        known = min(RATIO_HINTS, key=lambda value: abs(ratio / value - 1.0))
+        near = abs(ratio / known - 1.0) < HINT_TOLERANCE
+        raise InputError(
+            f"{name}: speed: {ratio:.4g} times the speed of the positions: "
+            f"expected {low:g} to {high:g}{'; ' + RATIO_HINTS[known] if near else ''}"
+        )
+
+
+def _check_headings(name: str, cars: Sequence[Track], rate_hz: float) -> None:
+    """Check headings against directions of travel; name the convention that fits."""
+    travels, angles = [], []
+    for track in cars:
+        span, moved, lasted = _windows(track, rate_hz)
+        moving = np.hypot(*moved.T) > MOVING_MPS * lasted
+        if moving.any():
+            middle = track.heading[span // 2 : span // 2 + lasted.size]
+            travels.append(np.arctan2(moved[moving, 1], moved[moving, 0]))
+            angles.append(middle[moving])
+    if len(travels) < MIN_CARS or sum(map(len, travels)) < MIN_MOVING_SAMPLES:
+        return
+    travel, angle = np.concatenate(travels), np.concatenate(angles)
+    apart = {}  # rad in the median, by convention
+    for (unit_words, unit), (words, sign, zero) in itertools.product(UNITS, DIRECTIONS):
+        turn = np.exp(1j * (sign * unit * angle + zero - travel))
+        apart[f"{words} in {unit_words}"] = float(np.median(np.abs(np.angle(turn))))
+    usual = apart.pop(next(iter(apart)))
+    if usual <= HEADING_FITS:
+        return
+    best = min(apart, key=apart.__getitem__)
+    fits = apart[best] <= HEADING_FITS_WELL
+    raise InputError(
+        f"{name}: heading: {math.degrees(usual):.0f} degrees from the direction of "
+        f"travel in the median: expected up to {math.degrees(HEADING_FITS):.0f}, as "
+        "radians counter-clockwise from +x"
+        + (f"; the file's angles seem to be {best}" if fits else "")
     )
