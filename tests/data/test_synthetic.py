@@ -9,11 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rcirl_jax.data.formats.synthetic import reader as synthetic
+from rcirl_jax.data.formats.synthetic.roads import ROADS, to_world
+from rcirl_jax.data.formats.synthetic.traffic import (
+    DRIVER,
+    Neighbours,
+    State,
+    idm_acceleration,
+)
 from rcirl_jax.data.recording import validate_recording
-from rcirl_jax.data.synthetic import ROADS
-from rcirl_jax.data.synthetic.drivers import DRIVER, idm_acceleration
-from rcirl_jax.data.synthetic.roads import to_world
-from rcirl_jax.data.synthetic.state import Neighbours, State
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Recording, Track
 from tests.helpers.logs import refused

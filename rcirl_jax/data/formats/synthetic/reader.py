@@ -16,11 +16,15 @@ import msgspec
 import numpy as np
 
 from rcirl_jax.data.formats.options import STATED
+from rcirl_jax.data.formats.synthetic.roads import ROADS, lanes, to_world
+from rcirl_jax.data.formats.synthetic.traffic import (
+    DriverConfig,
+    Log,
+    RunConfig,
+    schedule,
+    simulate,
+)
 from rcirl_jax.data.recording import LEAVE_OUT, validate_recording
-from rcirl_jax.data.synthetic import ROADS, DriverConfig, RunConfig, simulate
-from rcirl_jax.data.synthetic.roads import lanes, to_world
-from rcirl_jax.data.synthetic.stops import schedule
-from rcirl_jax.data.synthetic.traffic import Log
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.checked import check_names, checked
 from rcirl_jax.runtime.specs import load_toml
