@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rcirl_jax.data.formats.synthetic import reader as synthetic
-from rcirl_jax.data.formats.synthetic.roads import ROADS, to_world
+from rcirl_jax.data.formats.synthetic.roads import ROADS
 from rcirl_jax.data.formats.synthetic.traffic import (
     DRIVER,
     Neighbours,
@@ -226,25 +226,6 @@ def test_neighbour_search_equals_brute_force():
             assert state.s[r, leader[r, i]] - state.s[r, i] == ahead[r, i]
 
 
-@pytest.mark.parametrize("name", sorted(ROADS))
-def test_roads_are_what_they_say(name):
-    road = ROADS[name]()
-    s = np.linspace(1.0, road.length - 1.0, 4000)
-    x, y, heading = to_world(road, s, np.zeros_like(s), np.zeros_like(s))
-    step = np.hypot(np.diff(x), np.diff(y)) / np.diff(s)
-    np.testing.assert_allclose(step, 1.0, atol=1e-3)
-    chord = np.unwrap(np.arctan2(np.diff(y), np.diff(x)))
-    middle = 0.5 * (heading[1:] + heading[:-1])
-    np.testing.assert_allclose(chord, middle, atol=2e-3)
-    turn = {"urban_turn_left": 0.5, "urban_turn_right": -0.5}
-    if name in turn:
-        assert heading[-1] == pytest.approx(turn[name] * np.pi, abs=0.01)
-        assert 15.0 <= 1.0 / np.abs(road.kappa).max() <= 25.0
-    if name == "highway_s_curve":
-        assert 290.0 <= 1.0 / np.abs(road.kappa).max() <= 800.0
-        assert road.kappa.min() < 0.0 < road.kappa.max()
-
-
 @pytest.mark.parametrize(
     ("old", "new", "field"),
     [
@@ -269,10 +250,3 @@ def test_bad_toml_is_one_clear_line(tmp_path, old, new, field):
     line = refused(synthetic.recordings, path, load_toml(path))
     assert str(path) in line
     assert field in line
-
-
-def test_position_noise_is_added_to_positions_only(tmp_path):
-    clean, noisy = make(tmp_path)[0], make(tmp_path, noise=0.05)[0]
-    assert np.std(positions(noisy) - positions(clean)) == pytest.approx(0.05, rel=0.1)
-    for a, b in zip(clean.tracks, noisy.tracks, strict=True):
-        np.testing.assert_array_equal(a.speed, b.speed)

@@ -337,15 +337,6 @@ def test_a_quality_report_passes_through_its_state():
     assert set(report.as_dict()["dropped"]) == set(REASONS)
 
 
-def test_quantiles_of_values_that_are_met_often():
-    report = QualityReport()
-    report.futures.update({"104": 10, "160": 90})  # 5.2 s and 8 s
-    report.speeds.update({"0": 60, **{str(k): 1 for k in range(60, 100)}})
-    made = report.as_dict()
-    assert made["future_s"] == pytest.approx({"p05": 5.2, "p50": 8.0, "p95": 8.0})
-    assert made["speed_mps"]["p50"] == 0.0
-
-
 def other(value):
     """Something of the same type that is not equal."""
     if isinstance(value, bool):

@@ -9,7 +9,6 @@ from rcirl_jax.data.quality import QualityReport, format_quality
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.scenes.tracks import JOINED, SHORT, SMALL, joined, steady_tracks
-from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 from tests.helpers.roads import NO_FILTER, SERIES, WIDTH, car, recording, speeding_up
 
@@ -151,9 +150,3 @@ def test_they_are_counted_and_shown():
     quiet = QualityReport()
     quiet.add_recording(Collector(recording(EGO), NO_FILTER))
     assert "flicker" not in quiet.as_dict()
-
-
-@pytest.mark.parametrize("name", ["min_life_s", "min_size_m", "join_gap_s"])
-def test_what_cannot_be_meant(name):
-    with pytest.raises(InputError, match=name):
-        CollectConfig(**{name: -1.0})

@@ -64,22 +64,6 @@ def test_restored_iterator_continues_to_the_bit(count, size, cut):
     assert resumed.state() == batches.state()
 
 
-@pytest.mark.parametrize("processes", [2, 4])
-def test_processes_share_the_same_global_batches(processes):
-    rows = make_rows(21)
-    whole = BatchIterator(rows, batch_size=8, seed=2)
-    parts = [
-        BatchIterator(rows, batch_size=8, seed=2, shard_index=i, num_shards=processes)
-        for i in range(processes)
-    ]
-    for _ in range(7):
-        batch, weight, index = next(whole)
-        pieces = [next(part) for part in parts]
-        joined = jax.tree.map(lambda *x: np.concatenate(x), *pieces)
-        assert equal(joined, (batch, weight, index))
-    assert all(part.state() == whole.state() for part in parts)
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
@@ -109,19 +93,6 @@ def test_states_of_other_runs_are_refused(change, words):
     assert words in refused(batches.restore, {**batches.state(), **change})
     line = refused(batches.restore, {"position": 0, "seed": 0})
     assert "epoch: missing" in line
-
-
-def test_order_depends_on_epoch_and_seed():
-    rows = make_rows(50)
-
-    def order(seed, epochs):
-        batches = BatchIterator(rows, batch_size=50, seed=seed)
-        return [index.tolist() for _, _, index in take(batches, epochs)]
-
-    first, second = order(0, 2)
-    assert first != second
-    assert order(0, 2) == [first, second]
-    assert order(1, 1) != [first]
 
 
 @pytest.fixture(scope="module")

@@ -2,8 +2,6 @@ import contextlib
 import hashlib
 import json
 import shutil
-import tarfile
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -18,7 +16,6 @@ from rcirl_jax.data.store.rows import row_spec
 from rcirl_jax.data.store.writer import DatasetWriter
 from tests.helpers.logs import refused
 
-GOLDEN = Path(__file__).parent / "golden"
 SIZES = (300, 40, 7)  # rows per shard: more than one block, less than one block
 NUM_GROUPS = 4
 SPECIAL = np.array([np.nan, -np.nan, np.inf, -np.inf, -0.0, 1e-42, 3.4e38], np.float32)
@@ -156,15 +153,6 @@ def test_read_gives_rows_in_the_order_asked(made, asked, verify):
     for bad in ([-1], [sum(SIZES)], [[0]]):
         with pytest.raises(IndexError, match="expected a list of numbers below"):
             dataset.read(np.array(bad))
-
-
-def test_a_dataset_of_an_old_version_says_to_import_again(tmp_path):
-    """Written by the first code with datasets, never made anew: without rates."""
-    with tarfile.open(GOLDEN / "dataset_1.tar.xz") as archive:
-        archive.extractall(tmp_path, filter="data")
-    words = "schema_version: 1: expected 2; import the logs again with this version"
-    line = refused(open_dataset, tmp_path)
-    assert line == f"{tmp_path}/manifest.json: {words}"
 
 
 def test_no_dataset_and_interrupted_import_are_told_apart(copy, tmp_path):

@@ -8,8 +8,6 @@ import pytest
 from rcirl_jax.data.store.resplit import (
     HOLDOUTS,
     Resplit,
-    by_recording,
-    by_vehicle,
     folds_by_recording,
     held_out,
     subsample,
@@ -46,17 +44,6 @@ class Rows:
         return self.read(self.indices(split))
 
 
-@pytest.mark.parametrize(
-    "split",
-    [by_vehicle(Rows(), 0.25, 3), by_recording(Rows(), [0, 2])],
-)
-def test_no_vehicle_is_the_ego_on_both_sides(split):
-    train, test = (set(split.load(name).vehicle) for name in ("train", "test"))
-    assert train
-    assert test
-    assert not train & test
-
-
 @pytest.mark.parametrize("how", HOLDOUTS)
 def test_who_is_held_out_may_be_an_obstacle_of_the_others(how):
     split, _ = held_out(Rows(), how, recordings=[1, 3])
@@ -82,13 +69,6 @@ def test_what_is_held_out(how):
     else:
         assert np.unique(test.vehicle).size == 10
         assert not np.isin(split.indices("test"), Rows().test).all()
-
-
-def test_a_quarter_of_the_vehicles_by_seed():
-    one, again, other = (by_vehicle(Rows(), 0.25, seed) for seed in (1, 1, 2))
-    assert np.unique(one.load("test").vehicle).size == 10
-    np.testing.assert_array_equal(one.indices("test"), again.indices("test"))
-    assert one.hash == again.hash != other.hash
 
 
 def test_fewer_is_nested_and_keeps_the_test_rows():
