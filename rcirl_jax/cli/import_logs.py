@@ -27,7 +27,7 @@ from rcirl_jax.data.formats.csv.suggest import suggested
 from rcirl_jax.data.formats.files import table_stem
 from rcirl_jax.data.formats.recognise import recognised_format
 from rcirl_jax.data.importing import ImportConfig, import_logs
-from rcirl_jax.data.inputs import leaving_out
+from rcirl_jax.data.inputs import input_files, leaving_out
 from rcirl_jax.data.quality import format_quality, format_splits
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
