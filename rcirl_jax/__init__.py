@@ -21,13 +21,13 @@ if TYPE_CHECKING:
         tune,
     )
     from rcirl_jax.api.scenes import (
-        as_seen,
         candidates_from,
         compute_features,
         feature_prices,
         response_curves,
         sample_candidates,
         score_candidates,
+        with_predicted_futures,
     )
     from rcirl_jax.data.store.dataset import open_dataset
     from rcirl_jax.errors import InputError
@@ -43,7 +43,6 @@ __all__ = [
     "Reward",
     "Signal",
     "WeightsError",
-    "as_seen",
     "candidates_from",
     "compute_features",
     "feature_prices",
@@ -61,6 +60,7 @@ __all__ = [
     "simulate",
     "train_reward",
     "tune",
+    "with_predicted_futures",
 ]
 
 # name -> the module that has it
@@ -72,7 +72,12 @@ _PLACES = {
             *("format_report", "tune"),
         ),
         "api.scenes": (
-            *("as_seen", "sample_candidates", "candidates_from", "compute_features"),
+            *(
+                "with_predicted_futures",
+                "sample_candidates",
+                "candidates_from",
+                "compute_features",
+            ),
             *("score_candidates", "response_curves", "feature_prices"),
         ),
         "data.store.dataset": ("open_dataset",),

@@ -78,7 +78,7 @@ from rcirl_jax.export.from_run import verification_samples, write_weights
 from rcirl_jax.export.loading import open_reward, scorer_of
 from rcirl_jax.export.reader import PriorCost
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.prediction import as_seen
+from rcirl_jax.planner.prediction import with_predicted_futures
 from rcirl_jax.planner.rank import ONLINE, Params, Score, hand_score
 from rcirl_jax.report.charts import Interval, interval_chart
 from rcirl_jax.reward import LOSSES, seen_range
@@ -189,7 +189,7 @@ def spread(scenes: Scene, rows: jax.Array, score: Score, params: Params) -> jax.
     """Mean [] over scenes [S] of the deviation over their feasible candidates."""
 
     def one(item: tuple[Scene, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        scene = as_seen(item[0])
+        scene = with_predicted_futures(item[0])
         scene = scene.replace(time_valid=jnp.ones_like(scene.time_valid))
         candidates = sample(candidates_key(item[1]), scene, ONLINE)
         counts = candidates.feasible

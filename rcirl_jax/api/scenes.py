@@ -35,7 +35,7 @@ from rcirl_jax.types import Candidates, Scene, Trajectory
 from rcirl_jax.units import NUM_TIMES
 
 
-def as_seen(scene: Scene) -> Scene:
+def with_predicted_futures(scene: Scene) -> Scene:
     """Make of a recorded scene what a planner sees at its first moment.
 
     In a dataset the others drive on as they did. A planner does not know that: here
@@ -44,11 +44,11 @@ def as_seen(scene: Scene) -> Scene:
 
     Examples:
         >>> dataset = rcirl_jax.open_dataset("data")
-        >>> scene = rcirl_jax.as_seen(dataset[0].scene)
+        >>> scene = rcirl_jax.with_predicted_futures(dataset[0].scene)
         >>> float(scene.ego.v) == float(dataset[0].scene.ego.v)
         True
     """
-    return jax.device_get(_as_seen(scene))
+    return jax.device_get(_predicted(scene))
 
 
 def sample_candidates(
@@ -151,7 +151,7 @@ def score_candidates(
 
     Args:
       reward: of `load_weights`; one with a prior cost is added to the hand-set cost.
-      scene: one scene, as the planner sees it (`as_seen`, `scene_from`).
+      scene: one scene, as the planner sees it (`with_predicted_futures`, `scene_from`).
       candidates: K of them, sampled or your own.
 
     Returns:
@@ -164,7 +164,8 @@ def score_candidates(
 
     Examples:
         >>> reward = rcirl_jax.load_weights("weights.msgpack")
-        >>> scene = rcirl_jax.as_seen(rcirl_jax.open_dataset("data")[0].scene)
+        >>> recorded = rcirl_jax.open_dataset("data")[0].scene
+        >>> scene = rcirl_jax.with_predicted_futures(recorded)
         >>> candidates = rcirl_jax.sample_candidates(scene)
         >>> values = rcirl_jax.score_candidates(reward, scene, candidates)
         >>> values[~candidates.feasible] = -float("inf")
@@ -198,7 +199,7 @@ def _positions(
     return numbers
 
 
-_as_seen = jax.jit(prediction.as_seen)
+_predicted = jax.jit(prediction.with_predicted_futures)
 _sample = jax.jit(sample, static_argnames="config")
 
 

@@ -8,7 +8,7 @@ learner is trained on what it will see while driving:
     the nearest line that demands a stop now, as a wall for all times;
     the destination, where it lies within the view.
 
-A scene from a log holds the recorded future instead; `as_seen` puts the
+A scene from a log holds the recorded future instead; `with_predicted_futures` puts the
 prediction in its place.
 """
 
@@ -235,7 +235,7 @@ def bodies_now(obstacles: Obstacles) -> Bodies:
     )
 
 
-def as_seen(scene: Scene) -> Scene:
+def with_predicted_futures(scene: Scene) -> Scene:
     """A scene from a log as the planner would have seen it at t = 0.
 
     Recorded futures are replaced by predicted ones, and lines by what they demand now;
@@ -253,7 +253,7 @@ def as_seen(scene: Scene) -> Scene:
     return scene.replace(obstacles=seen)
 
 
-def either(scene: Scene, predicted: jax.Array) -> Scene:
+def select_future(scene: Scene, predicted: jax.Array) -> Scene:
     """A scene from a log as the planner sees it, or as recorded.
 
     Args:
@@ -266,5 +266,7 @@ def either(scene: Scene, predicted: jax.Array) -> Scene:
         empty = [(0, more), *[(0, 0)] * (seen.ndim - 1)]
         return jnp.where(predicted, jnp.pad(seen, empty), recorded)
 
-    obstacles = jax.tree.map(one, as_seen(scene).obstacles, scene.obstacles)
+    obstacles = jax.tree.map(
+        one, with_predicted_futures(scene).obstacles, scene.obstacles
+    )
     return scene.replace(obstacles=obstacles)

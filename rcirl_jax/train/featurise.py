@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.features.columns import candidate_frames
-from rcirl_jax.planner.prediction import as_seen, either
+from rcirl_jax.planner.prediction import select_future, with_predicted_futures
 from rcirl_jax.sampling import (
     SamplerConfig,
     hard_negatives,
@@ -63,8 +63,10 @@ def _under_futures(key: jax.Array, scene: Scene, futures: str) -> Scene:
     if futures == "recorded":
         return scene
     if futures == "predicted":
-        return as_seen(scene)
-    return either(scene, jax.random.bernoulli(jax.random.fold_in(key, FUTURES_STREAM)))
+        return with_predicted_futures(scene)
+    return select_future(
+        scene, jax.random.bernoulli(jax.random.fold_in(key, FUTURES_STREAM))
+    )
 
 
 def featurise(

@@ -26,7 +26,7 @@ from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import PriorCost
 from rcirl_jax.features import FeatureMap, feature_map
-from rcirl_jax.planner.prediction import as_seen
+from rcirl_jax.planner.prediction import with_predicted_futures
 from rcirl_jax.reward.familiarity import (
     Familiarity,
     familiarity_logit,
@@ -123,7 +123,7 @@ def scene_features(scenes: Scene, features: FeatureMap) -> np.ndarray:
 @functools.partial(jax.jit, static_argnames="features")
 def _scene_features(scenes: Scene, features: FeatureMap) -> jax.Array:
     def one(scene: Scene) -> jax.Array:
-        scene = as_seen(scene)
+        scene = with_predicted_futures(scene)
         straight = trajectory_on_path(scene, scene.ego.v * jnp.asarray(TIMES_S))
         only = Candidates(
             trajectory=jax.tree.map(lambda x: x[None], straight),

@@ -10,10 +10,10 @@ from rcirl_jax.planner.plan import held
 from rcirl_jax.planner.prediction import (
     NUM_BODIES,
     Bodies,
-    as_seen,
-    either,
     predict,
     relevant,
+    select_future,
+    with_predicted_futures,
 )
 from rcirl_jax.simulation.recorded.scenes import case_of
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
@@ -23,7 +23,7 @@ from tests.helpers.scenes import random_scene, scene
 from tests.simulation.stored import CUT, straight, tracks
 
 PREDICT = jax.jit(predict)
-AS_SEEN = jax.jit(as_seen)
+AS_SEEN = jax.jit(with_predicted_futures)
 
 
 def bodies(*rows):
@@ -124,7 +124,7 @@ def test_what_is_seen_depends_on_the_present_alone(seed):
 @pytest.mark.parametrize("predicted", [True, False])
 def test_either_future_of_a_scene(predicted):
     made = jax.tree.map(jnp.asarray, random_scene(2))
-    found = jax.jit(either)(made, jnp.asarray(predicted)).obstacles
+    found = jax.jit(select_future)(made, jnp.asarray(predicted)).obstacles
     wanted = (AS_SEEN(made) if predicted else made).obstacles
     slots = wanted.valid.shape[0]
     same = jax.tree.map(lambda x, y: np.array_equal(x[:slots], y), found, wanted)

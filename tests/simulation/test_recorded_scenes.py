@@ -15,7 +15,7 @@ from rcirl_jax.evaluation.closed_loop.likeness import (
 from rcirl_jax.evaluation.gate.types import Likeness
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.plan import held
-from rcirl_jax.planner.prediction import as_seen
+from rcirl_jax.planner.prediction import with_predicted_futures
 from rcirl_jax.planner.rank import idm_policy
 from rcirl_jax.simulation.recorded.scenes import (
     CLOCK_S,
@@ -46,7 +46,9 @@ def test_the_human_drives_its_own_log_and_the_planner_sees_the_stored_scene():
         # linear between the stored times: they lie closer than the curve bends
         np.testing.assert_allclose(record.s[i, :steps], expected, atol=0.05)
     seen = jax.tree.map(lambda x: np.asarray(x)[:, 0], scenes)
-    wanted = jax.vmap(as_seen)(jax.tree.map(jnp.asarray, drives.rows.scene))
+    wanted = jax.vmap(with_predicted_futures)(
+        jax.tree.map(jnp.asarray, drives.rows.scene)
+    )
     for name in ("l", "v", "a", "length", "width"):
         np.testing.assert_allclose(
             getattr(seen.ego, name), getattr(wanted.ego, name), atol=2e-3, err_msg=name

@@ -21,7 +21,7 @@ from rcirl_jax.evaluation.baselines.counted import Objective
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, covered_rows
 from rcirl_jax.evaluation.ranking.score import CHUNK, Baseline, horizon_mask, measured
 from rcirl_jax.planner.baselines import Idm, closeness, idm_trajectory
-from rcirl_jax.planner.prediction import as_seen
+from rcirl_jax.planner.prediction import with_predicted_futures
 from rcirl_jax.reward import TUNABLE, lattice_terms, tuned, weighted_cost
 from rcirl_jax.reward.hand import LatticeTerms
 from rcirl_jax.sampling import SamplerConfig
@@ -140,7 +140,7 @@ def problem(
     return Problem(objective=objective, queries=int(scenes.fde.size))
 
 
-_seen = jax.jit(jax.vmap(as_seen))
+_seen = jax.jit(jax.vmap(with_predicted_futures))
 
 
 def valued_scenes(

@@ -22,7 +22,7 @@ from rcirl_jax.planner.baselines import (
     constant_speed_trajectory,
     idm_trajectory,
 )
-from rcirl_jax.planner.prediction import as_seen
+from rcirl_jax.planner.prediction import with_predicted_futures
 from rcirl_jax.reward import (
     SPEED_DP_ROW,
     LatticeCost,
@@ -122,7 +122,7 @@ def _score_one(
     futures: str,
 ) -> dict:
     recorded = demonstration.scene
-    scene = as_seen(recorded) if futures == "predicted" else recorded
+    scene = with_predicted_futures(recorded) if futures == "predicted" else recorded
     mask = horizon_mask(scene, horizon_s)
     human = human_of(demonstration, sampler)
     candidates = sample(key, scene, sampler)
@@ -271,7 +271,7 @@ def measured(
 def _measure_batch(sampler: SamplerConfig, horizon_s: float, futures: str) -> Callable:
     def one(index: jax.Array, demonstration: Demonstration) -> dict:
         scene = demonstration.scene
-        scene = as_seen(scene) if futures == "predicted" else scene
+        scene = with_predicted_futures(scene) if futures == "predicted" else scene
         made, fde, ade = measured(index, demonstration, scene, sampler, horizon_s)
         return {"feasible": made.feasible, "fde": fde, "ade": ade}
 
