@@ -95,32 +95,6 @@ def test_a_recording_without_traffic_is_counted_and_skipped(tmp_path, three):
     assert not (tmp_path / "none").exists()
 
 
-def test_what_is_guessed_is_counted(tmp_path, three):
-    """No limits and sizes in one of three recordings."""
-    lanes = [dataclasses.replace(x, speed_limit=None) for x in three[0].lanes]
-    lanes = (*lanes[:1], *(dataclasses.replace(x, speed_limit=9.0) for x in lanes[1:]))
-    tracks = [dataclasses.replace(x, size_assumed=True) for x in three[0].tracks]
-    odd = dataclasses.replace(three[0], lanes=lanes, tracks=tuple(tracks))
-    known = [
-        dataclasses.replace(
-            one,
-            lanes=tuple(dataclasses.replace(x, speed_limit=9.0) for x in one.lanes),
-        )
-        for one in three[1:]
-    ]
-    quality = import_logs([odd, *known], tmp_path / "out", CONFIG).quality
-    count = {"speed limit": 1, "width": 0, "size": len(tracks)}
-    whole = {
-        "lanes": sum(len(one.lanes) for one in three),
-        "road users": sum(len(one.tracks) for one in three),
-    }
-    assert quality["assumed"] == {**count, **whole}
-    note = f"{odd.name}: assumed: 1 speed limit 29.06 m/s, {len(tracks)} size"
-    assert note in quality["notes"]
-    said = f"speed limit of 1 of {whole['lanes']} lanes, size of {len(tracks)} of"
-    assert said in format_quality(quality)
-
-
 @pytest.mark.usefixtures("small_shards")
 @pytest.mark.parametrize("name", ["manifest.json", "shards/00002/shard.json"])
 def test_too_many_names_leave_what_is_finished(tmp_path, monkeypatch, three, name):
