@@ -17,6 +17,7 @@ import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import cast
 
 import jax
 import numpy as np
@@ -478,18 +479,21 @@ def import_logs(
         shards, and the next run resumes from them.
     """
     places = executor or Serial()
-    if isinstance(logs, list) and all(isinstance(x, InputFile) for x in logs):
-        files, total = leaving_out(logs) if config.leaves_out else logs, len(logs)
-        units: Iterable[WorkUnit] = work_units(files, places.workers)
-    else:
-        units, total = ((None, recording) for recording in logs), None
+    given = logs if isinstance(logs, list) else []
+    files = [file for file in given if isinstance(file, InputFile)]
+    if config.leaves_out:
+        files = leaving_out(files)
+    recordings = () if files else cast(Iterable[Recording], logs)
+    units: Iterable[WorkUnit] = itertools.chain(
+        work_units(files, places.workers), ((None, one) for one in recordings)
+    )
     with Files(str(output)).alone():
         writer = DatasetWriter(str(output), overwrite=overwrite)
         try:
             state = _Import(writer, config)
             known = {entry["name"]: entry["sha256"] for entry in state.done}
             work = functools.partial(scenes_in, config=config.collect, done=known)
-            with Progress(total) as progress:
+            with Progress(len(files) or None) as progress:
                 for made in places.stream(work, units):
                     state.add(made)
                     progress.show(made, state.quality)

@@ -185,7 +185,8 @@ def sample_drivers(
     drivers = np.zeros(count, DRIVER)
     truck = rng.random(count) < road.truck_share
     for name, setting in RANGES.items():
-        drivers[name] = rng.uniform(*getattr(config, setting), count)
+        low, high = getattr(config, setting)
+        drivers[name] = rng.uniform(low, high, count)
     drivers["speed_factor"] = _normal(rng, config.speed_factor, count)
     median, sigma, low, high = config.headway_s
     drivers["headway"] = np.clip(median * rng.lognormal(0.0, sigma, count), low, high)
