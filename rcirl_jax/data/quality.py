@@ -123,7 +123,7 @@ class QualityReport:
             counts.update(map(str, np.round(values / step).astype(int).tolist()))
 
     def state(self) -> dict:
-        """All sums and lists, JSON-ready; `merge` takes it back."""
+        """Return all sums and lists, JSON-ready; `merge` takes it back."""
         return {
             name: dict(found) if isinstance(found, Counter) else found
             for name, found in vars(self).items()
@@ -173,7 +173,7 @@ class QualityReport:
 
 
 def assumed(recording: Recording) -> dict[str, int]:
-    """How many lanes and road users of a recording go by a guess."""
+    """Return how many lanes and road users of a recording go by a guess."""
     return {
         LIMIT: sum(lane.speed_limit is None for lane in recording.lanes),
         WIDTH: sum(lane.width_assumed for lane in recording.lanes),
@@ -199,12 +199,12 @@ def remedies(dropped: Mapping[str, int]) -> str:
 
 
 def dropped_rows(rows: Mapping[str, int]) -> int:
-    """Rows of tables that were dropped."""
+    """Return rows of tables that were dropped."""
     return sum(count for why, count in rows.items() if why != "read")
 
 
 def _headways(demonstrations: Demonstration) -> np.ndarray:
-    """Time headway [s] to the followed car at the planning frame, if any."""
+    """Return time headway [s] to the followed car at the planning frame, if any."""
     scene = demonstrations.scene
     follows = np.asarray(demonstrations.decisions) == Decision.FOLLOW
     front = 0.5 * np.asarray(scene.ego.length)[:, None]
@@ -243,7 +243,7 @@ def _histogram(counts: Counter, step: float) -> dict[str, int]:
 
 
 def format_quality(report: dict) -> str:
-    """The report as a terminal table."""
+    """Return the report as a terminal table."""
     lines = [
         f"{'recordings':<28}{report['recordings']:>10,}",
         f"{'tracks':<28}{report['tracks']:>10,}",
@@ -283,7 +283,7 @@ def format_quality(report: dict) -> str:
 
 
 def oddities(report: Mapping) -> list[str]:
-    """What was dropped, left out, skipped, guessed and noted."""
+    """Return what was dropped, left out, skipped, guessed and noted."""
     lines = []
     if "flicker" in report:
         lines.append(note_of(report["flicker"]))

@@ -230,7 +230,7 @@ def check_span(where: str, field: str, values: np.ndarray) -> None:
 
 
 def check_lanes_length(where: str, total: float) -> None:
-    """Lanes of `total` m together are no longer than roads are."""
+    """Check that lanes of `total` m together are no longer than roads are."""
     if total > MAX_LANES_M:
         raise InputError(
             f"{where}: lanes: {total:g} m long in all: expected up to {MAX_LANES_M:g} m"

@@ -98,7 +98,7 @@ class Collector:
         self._kind = np.array([t.track.kind for t in self.tracks], np.int32)
 
     def own_frames(self, smooth: SmoothTrack) -> slice:
-        """The samples of a track that are the recording's own, not surroundings.
+        """Return the samples of a track that are the recording's own, not surroundings.
 
         All of them, unless the recording is a piece of a longer log.
         """
@@ -119,14 +119,14 @@ class Collector:
         return low - 1e-6 <= smooth.track.first_seen_s < high - 1e-6
 
     def scenes(self) -> Iterator[dict]:
-        """Rows of one scene each, as flat dicts of numpy arrays."""
+        """Yield rows of one scene each, as flat dicts of numpy arrays."""
         rows = self._rows()
         while some := list(itertools.islice(rows, LABELLED_AT_ONCE)):
             labels.add_labels(some)
             yield from some
 
     def _rows(self) -> Iterator[dict]:
-        """Rows without their labels."""
+        """Yield rows without their labels."""
         for number, smooth in enumerate(self.tracks):
             if smooth.track.kind == Kind.VEHICLE:
                 yield from self._scenes_of(number, smooth)
@@ -203,7 +203,7 @@ class Collector:
     def _scene(
         self, number: int, start: int, frame: LaneFrame, driver: Driver
     ) -> dict | str:
-        """One scene, or the reason why there is none."""
+        """Return one scene, or the reason why there is none."""
         motion = human_motion(driver, start, frame.length)
         if motion is None:
             return "off_map"
@@ -409,7 +409,7 @@ class Collector:
 
 
 def stack_scenes(rows: list[dict]) -> Scene:
-    """Scenes [n, ...] from flat rows; floats become float32."""
+    """Return scenes [n, ...] from flat rows; floats become float32."""
 
     def leaf(name: str) -> Any:  # noqa: ANN401
         values = np.array([row[name] for row in rows])
@@ -449,7 +449,7 @@ def human_trajectories(scene: Scene, s: np.ndarray, l: np.ndarray) -> Trajectory
 def assemble(
     rows: list[dict], *, vehicles: list[int], groups: list[int], recording: int
 ) -> Demonstration:
-    """One batched Demonstration of a recording's rows.
+    """Return one batched Demonstration of a recording's rows.
 
     Args:
       rows: at least one row as made by `collect.Collector`.

@@ -26,7 +26,7 @@ class SignalChecks:
     unused: tuple[str, ...]
 
     def of_signals(self, recording: Recording) -> dict[str, bool]:
-        """Whether to use each signal that a judged line of the recording has.
+        """Return whether to use each signal that a judged line of the recording has.
 
         Of two lines with one light the one that confirms it counts.
         """
@@ -53,7 +53,7 @@ def line_name(recording: str, signal_ids: Iterable[str]) -> str:
 
 
 def signal_checks(verdicts: Mapping[str, str]) -> SignalChecks:
-    """Which lines' lights to use, by the verdicts on lines and on all together.
+    """Return which lines' lights to use, by the verdicts on lines and on all together.
 
     Used are the confirmed lines and, where all files together are confirmed, those
     that nothing speaks against. A rejected line is never used.

@@ -105,7 +105,7 @@ def _changes_lane(scenes: dict) -> np.ndarray:
 
 
 def _at(values: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """The values [..., k] at one index [...] of their last axis."""
+    """Return the values [..., k] at one index [...] of their last axis."""
     return np.take_along_axis(values, index[..., None], axis=-1)[..., 0]
 
 

@@ -48,7 +48,7 @@ class LaneFrame:
     stop_lines: tuple[tuple[float, Lane], ...]
 
     def table(self, name: str, stations: np.ndarray) -> np.ndarray:
-        """One of the lane tables at stations [m]."""
+        """Return one of the lane tables at stations [m]."""
         return np.interp(stations, self.station, getattr(self, name))
 
     def on_grid(self, name: str, stations: np.ndarray) -> np.ndarray:
@@ -120,7 +120,7 @@ class LaneGraph:
     def chain(
         self, start: str, visited: Iterable[str] | Mapping[str, int]
     ) -> tuple[str, ...]:
-        """The chain through lane `start` for a driver on these lanes.
+        """Return the chain through lane `start` for a driver on these lanes.
 
         `visited` may name a lane as often as the driver was seen on it: at a fork
         that counts.
@@ -169,7 +169,7 @@ class LaneGraph:
         return min(options, key=bend)
 
     def frame(self, chain: tuple[str, ...]) -> LaneFrame:
-        """The Frenet frame of a chain (cached)."""
+        """Return the Frenet frame of a chain (cached)."""
         if chain not in self._frames:
             self._frames[chain] = self._build_frame(chain)
         return self._frames[chain]
@@ -208,7 +208,7 @@ class LaneGraph:
         )
 
     def _beside(self, lane: Lane, side: str) -> float:
-        """Width [m] of all same-direction lanes on one side."""
+        """Return width [m] of all same-direction lanes on one side."""
         total, name, seen = 0.0, getattr(lane, side), {lane.id}
         while name in self.lanes and name not in seen:
             seen.add(name)
@@ -224,7 +224,7 @@ def _project(line: ReferenceLine, points: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def project(frame: LaneFrame, x: np.ndarray, y: np.ndarray) -> tuple:
-    """Station and lateral offset [m] of positions in the chain's frame."""
+    """Return station and lateral offset [m] of positions in the chain's frame."""
     return _project(frame.line, np.stack([x, y], axis=1))
 
 

@@ -100,7 +100,7 @@ def _fronts(tracks: Sequence[Track]) -> _Fronts:
 
 
 def _crossings(fronts: _Fronts, line: np.ndarray) -> np.ndarray:
-    """Time [s] at which each front that does first crosses the segment [2, 2].
+    """Return time [s] at which each front that does first crosses the segment [2, 2].
 
     By hand, because shapely first makes a line of every step: 50 times slower.
     """

@@ -110,7 +110,7 @@ def human_speed(scenes: dict) -> np.ndarray:
 
 
 def meetings(scenes: dict) -> Meetings:
-    """All obstacles beside the human; `scenes` has `FIELDS`."""
+    """Return all obstacles beside the human; `scenes` has `FIELDS`."""
     s_lower, s_upper, l_lower, l_upper = (scenes[f"obstacles.{x}"] for x in BOUNDS)
     kind = scenes["obstacles.kind"]
     human_s, human_l = (scenes[f"human.{x}"][..., None, :] for x in ("s", "l"))

@@ -79,7 +79,7 @@ def driver_of(view: FrameTracks, number: int, rate: float) -> Driver:
 
 
 def human_motion(driver: Driver, start: int, length: float) -> Motion | None:
-    """The human's positions at TIMES_S and the ego's state at the frame.
+    """Return the human's positions at TIMES_S and the ego's state at the frame.
 
     v0 and a0 are the first and second derivative of the cubic fitted by the
     smoothing filter; all later derivatives are made by `sampling.kinematics`.

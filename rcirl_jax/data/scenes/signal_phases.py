@@ -56,7 +56,7 @@ class Event:
     signals: tuple[Signal, ...]  # that govern the line; any of them may allow
 
     def state(self, offset: float) -> str:
-        """The line's most permissive colour, its cycles moved by `offset` s.
+        """Return the line's most permissive colour, its cycles moved by `offset` s.
 
         Whether a car goes straight or turns is not known. A dark signal (an
         arrow that is off) leaves the word to the others.
@@ -159,7 +159,7 @@ def _events(recording: Recording, lane: Lane) -> list[tuple[float, bool, bool]]:
 
 
 def crossing_time(track: Track, lane: Lane) -> float | None:
-    """Time [s] at which a track's front is first over the lane's line."""
+    """Return time [s] at which a track's front is first over the lane's line."""
     distance, reach = before_line(track, lane)
     over = (distance[:-1] > 0.0) & (distance[1:] <= 0.0) & reach[1:]
     return float(track.t[1:][over][0]) if over.any() else None
@@ -205,7 +205,7 @@ def line_events(recording: Recording) -> LineEvents:
 
 
 def check_events(recorded: Iterable[LineEvents]) -> list[PhaseCheck]:
-    """One check per line over all recordings, and one of all lines together.
+    """Return one check per line over all recordings, and one of all lines together.
 
     Lines are the same if their signals' ids are and the recordings' names agree up to
     the last "-", as in CommonRoad's names of places.
@@ -305,7 +305,7 @@ def _verdict(crossings: int, red: float, p: float) -> str:
 
 
 def format_phases(checks: Sequence[PhaseCheck]) -> str:
-    """The checks as a terminal table."""
+    """Return the checks as a terminal table."""
     head = (
         f"{'signals':<34}{'files':>6}{'cross':>6}{'right':>6}{'stand':>6}{'red,%':>7}"
         f"{'st.red,%':>9}{'best,s':>7}{'red,%':>7}{'p':>6}  verdict"

@@ -51,7 +51,7 @@ def steady_tracks(
 
 
 def note_of(counts: Mapping[str, int]) -> str:
-    """One line for the report of a recording."""
+    """Return one line for the report of a recording."""
     said = ", ".join(f"{count} {what}" for what, count in sorted(counts.items()))
     return f"tracks that flicker: {said}"
 
@@ -67,7 +67,7 @@ def _life(track: Track, begin: float, end: float) -> float:
 
 
 def joined(tracks: Sequence[Track], gap_s: float) -> list[Track]:
-    """The tracks, those in one piece that are fragments of one standing body.
+    """Return the tracks, those in one piece that are fragments of one standing body.
 
     A track goes on for another one if both stand in the same place where they meet:
     it begins at most `gap_s` after the other ends, or while it is there.
@@ -89,7 +89,7 @@ def joined(tracks: Sequence[Track], gap_s: float) -> list[Track]:
 def _goes_on_for(
     made: dict[int, Track], after: Track, ends: np.ndarray, gap_s: float
 ) -> int | None:
-    """The number of the track that stands where another begins, or None."""
+    """Return the number of the track that stands where another begins, or None."""
     t, x, y, speed = _sample(after, 0)
     if speed >= STANDING_MPS:
         return None
@@ -102,7 +102,7 @@ def _goes_on_for(
 
 
 def _is_same(before: Track, after: Track) -> bool:
-    """Whether a track stands where another begins, from then to its own end."""
+    """Return whether a track stands where another begins, from then to its own end."""
     alike = before.kind == after.kind or {before.kind, after.kind} <= {*HULKS}
     t, x, y, _ = _sample(after, 0)
     if before.t[0] >= t or not alike:
@@ -120,7 +120,7 @@ def _sample(track: Track, at: int) -> tuple[float, float, float, float]:
 
 
 def _join(before: Track, after: Track) -> Track:
-    """One track: all of the first, then what the second has beyond its end."""
+    """Return one track: all of the first, then what the second has beyond its end."""
     later = after.t > before.t[-1]
     series = {
         name: np.concatenate([getattr(before, name), getattr(after, name)[later]])
@@ -214,7 +214,7 @@ def _filters(window: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def harsh_share(x: np.ndarray, y: np.ndarray, rate_hz: float) -> tuple[int, int]:
-    """How many accelerations exceed HARSH_MPS2 in magnitude, and of how many.
+    """Return how many accelerations exceed HARSH_MPS2 in magnitude, and of how many.
 
     a = d(speed)/dt with the speed from differences of positions.
     """

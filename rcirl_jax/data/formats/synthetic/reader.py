@@ -75,7 +75,7 @@ class _Entry(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """All recordings that a TOML file declares.
+    """Yield all recordings that a TOML file declares.
 
     Args:
       path: the file, like data_specs/sources/synthetic.toml.
@@ -234,7 +234,7 @@ def _track(
 
 
 def _destination(driver: np.void, log: Log) -> tuple[float, float] | None:
-    """Where the car stands, or wants to stand, on the strip."""
+    """Return where the car stands, or wants to stand, on the strip."""
     station = float(driver["destination"])
     if not math.isfinite(station):
         return None

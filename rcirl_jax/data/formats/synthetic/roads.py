@@ -122,7 +122,7 @@ def to_world(
 
 
 def lanes(road: Road) -> tuple[Lane, ...]:
-    """The road's lanes, cut at stop lines and limit changes, and its strip.
+    """Return the road's lanes, cut at stop lines and limit changes, and its strip.
 
     Piece p of lane k is named "k.p"; the strip is lane `num_lanes`. A stop line
     belongs to the piece that ends at it and is governed by signal "signal-i".

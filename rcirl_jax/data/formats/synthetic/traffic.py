@@ -268,7 +268,7 @@ def interaction(
     headway: np.ndarray | float,
     jam_gap: np.ndarray | float,
 ) -> np.ndarray:
-    """The IDM's interaction term a (s*/g)^2 [m/s^2], >= 0."""
+    """Return the IDM's interaction term a (s*/g)^2 [m/s^2], >= 0."""
     closing = v * (v - leader_v) / (2.0 * np.sqrt(a * b))
     wanted = jam_gap + np.maximum(0.0, v * headway + closing)
     return a * (wanted / np.maximum(gap, MIN_GAP_M)) ** 2
@@ -432,7 +432,7 @@ class State:
         return np.maximum(1.0 / seconds, (1.0 - self.phase) / left)
 
     def lateral(self, table: RoadTable) -> tuple[np.ndarray, np.ndarray]:
-        """Offset [m] and slope dl/ds of every vehicle."""
+        """Return offset [m] and slope dl/ds of every vehicle."""
         q, rate = quintic(self.phase)
         start, end = table.offset(self.old_lane), table.offset(self.lane)
         wander, tilt = drift(self.driver, self.s)
@@ -593,7 +593,7 @@ def _wish(state: State, table: RoadTable, side: int) -> np.ndarray:
 def pull_over(
     state: State, table: RoadTable, config: DriverConfig, clock: float
 ) -> None:
-    """Drivers at their destination leave the right lane, or give it up.
+    """Move drivers at their destination off the right lane, or give it up.
 
     They give up if they are not in the right lane in time or if somebody
     stands where they want to.
@@ -749,7 +749,7 @@ class _Source:
         return MIN_HEADWAY_S + self.rng.exponential(rest, count)
 
     def peek(self) -> np.ndarray:
-        """The driver who enters next."""
+        """Return the driver who enters next."""
         if self.used == len(self.pool):
             more = sample_drivers(self.rng, self.config, self.road, POOL)
             self.pool = np.concatenate([self.pool, more])
