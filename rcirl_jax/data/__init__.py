@@ -1,5 +1,6 @@
 """Logs -> recordings -> scenes -> a dataset on disk.
 
-`importers` yields a `Recording` per log, `scenes` cuts demonstrations from it, `store`
-keeps them; `importing.py` runs this over many logs, piece by piece (`parts`, `cut`).
+`formats` yields a `Recording` per log (`recording.py` checks it), `scenes` cuts
+demonstrations from it, `store` keeps them; `importing.py` runs this over many logs,
+which `inputs.py` deals out file by file.
 """
