@@ -200,7 +200,7 @@ ON_LANELET = '<position><lanelet ref="1"/></position>'
     ("goal", "end"),
     [(RECTANGLE, (25.0, 1.0)), (ON_LANELET, (30.0, 0.0)), ("", (30.0, 0.0))],
 )
-def test_ghost_reaches_the_goal(tmp_path, goal, end):
+def test_a_missing_agent_reaches_the_goal(tmp_path, goal, end):
     (agent,) = scenario(tmp_path, road(), w.problem(goal, speed=10.0)).missing_agents
     assert (agent.t0, agent.t1, agent.start) == (0.0, pytest.approx(3.0), (0.0, 0.0))
     np.testing.assert_allclose(agent.end, end, atol=0.6)

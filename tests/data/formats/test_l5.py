@@ -10,6 +10,7 @@ import pytest
 from rcirl_jax.data.formats import parts, read_recordings
 from rcirl_jax.data.formats.l5 import map as l5_map
 from rcirl_jax.data.formats.l5 import reader as l5
+from rcirl_jax.data.importing import digest
 from tests.data.formats.fixtures import l5 as fixture
 from tests.helpers import logs
 from tests.helpers.logs import lanes_of, refused

@@ -291,7 +291,7 @@ def hard():
     jerky = car("ego", lambda t: 20 + 12 * t + 4.0 * np.sin(2 * t))
     leaves = car("ego", speeding_up(20.0), y=lambda t: 9.0 * smooth_step(t, 1, 5))
     by_machine = dataclasses.replace(ego, automated=((5.0, 12.0),))
-    ghost = MissingAgent(t0=0.0, t1=10.0, start=(45.0, 0.0), end=(190.0, 0.0))
+    agent = MissingAgent(t0=0.0, t1=10.0, start=(45.0, 0.0), end=(190.0, 0.0))
     short = car("lead", speeding_up(60.0), seconds=2.0)
     return {
         "future_too_short": recording(car("ego", speeding_up(20.0), seconds=3.0)),
@@ -302,7 +302,7 @@ def hard():
         "no_speed_change": recording(steady, lead),
         "too_noisy": recording(jerky, lead),
         "overlapping_boxes": recording(ego, car("twin", speeding_up(22.0))),
-        "follows_missing_car": recording(ego, lead, missing_agents=(ghost,)),
+        "follows_missing_car": recording(ego, lead, missing_agents=(agent,)),
         "surroundings_end": recording(ego, short),
     }
 
