@@ -26,7 +26,7 @@ QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_write
   export_and_rank exported_values_are_the_trainers) \
   tests/data/formats/test_conformance.py tests/data/store/test_dataset.py \
   tests/data/test_import_elsewhere.py::test_no_cluster_is_one_line \
-  tests/evaluation/baselines/test_cma_es.py::test_it_finds_the_minimum_of_a_shifted_sphere \
+  tests/evaluation/test_baselines.py::test_cma_es_finds_the_minimum_of_a_shifted_sphere \
   tests/export/test_forms.py tests/export/test_reader.py tests/export/test_weights.py \
   tests/features/test_features.py::test_equals_the_oracle tests/report/test_data_page.py
 QUICKLY = -m pytest -q -m "not slow and not dataset" $(QUICK)
@@ -39,7 +39,7 @@ ONCE := $(PIP) install --no-compile
 # and `tests/train/test_processes.py` start
 EXACT := $(addprefix tests/,evaluation/test_recorded_training.py \
   features/test_features.py reward/test_gradients.py \
-  evaluation/baselines/test_tuned.py::test_distances_alone_are_those_of_the_scores \
+  evaluation/test_baselines.py::test_distances_alone_are_those_of_the_scores \
   $(addprefix train/test_,loop.py::test_every_scene_counts_once_for_the_normaliser \
     loop.py::test_resume_is_bitwise \
     step.py::test_candidates_of_a_scene_do_not_depend_on_the_batch \

@@ -19,7 +19,7 @@ from rcirl_jax.data.scenes.signal_phases import check_written, format_phases
 from rcirl_jax.data.store.joined import EQUAL, Demonstrations
 from rcirl_jax.data.store.resplit import HOLDOUTS, folds_by_recording, held_out
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.baselines.tuned import SEARCHES
+from rcirl_jax.evaluation.baselines import SEARCHES
 from rcirl_jax.evaluation.gate.types import GateConfig
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW
 from rcirl_jax.reward import LOSSES

@@ -26,7 +26,7 @@ from rcirl_jax.cli import flags as shared
 from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.joined import Demonstrations
-from rcirl_jax.evaluation.baselines.tuned import as_numbers, tuned_baselines
+from rcirl_jax.evaluation.baselines import as_numbers, tuned_baselines
 from rcirl_jax.evaluation.ranking.evaluate import (
     RankingSetup,
     pooled,

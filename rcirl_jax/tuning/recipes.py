@@ -283,7 +283,7 @@ class TuneConfig:
     data_weights: str = EQUAL  # of several sources, as `data.store.joined.shares_of`
     recipe: str = ""  # its name, for the report
     seeds: int = 1
-    search: str = "cma"  # of the tuned IDM: one of `baselines.tuned.SEARCHES`
+    search: str = "cma"  # of the tuned IDM: one of `baselines.SEARCHES`
     drives: int = 240  # held-out, for human-likeness
     horizon_s: float = 5.0
     suite: str = "full"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.joined import Demonstrations
-from rcirl_jax.evaluation.baselines.tuned import tune_idm
+from rcirl_jax.evaluation.baselines import tune_idm
 from rcirl_jax.evaluation.closed_loop.files import (
     SuiteRuns,
     read_runs,

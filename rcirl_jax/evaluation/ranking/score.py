@@ -230,7 +230,7 @@ def score_scenes(
     )
     parts = []
     with CompilesFirst(total=len(index), desc="rank the scenes", unit="scene") as bar:
-        for part in (executor or Serial()).stream(piece, _chunks(rows, index)):
+        for part in (executor or Serial()).stream(piece, chunks(rows, index)):
             parts.append(part)
             bar.update(len(part["fde"]))
     return Scored(**jax.tree.map(lambda *x: np.concatenate(x), *parts))
@@ -293,12 +293,12 @@ def measure_scenes(
     measure = _measure_batch(sampler, float(horizon_s), futures)
     parts = [
         jax.tree.map(lambda x, keep=keep: np.asarray(x)[:keep], measure(at, taken))
-        for taken, at, keep in _chunks(rows, index)
+        for taken, at, keep in chunks(rows, index)
     ]
     return Measured(**jax.tree.map(lambda *x: np.concatenate(x), *parts))
 
 
-def _chunks(
+def chunks(
     rows: Demonstration, index: np.ndarray
 ) -> Iterator[tuple[Demonstration, np.ndarray, int]]:
     """Chunks of equal size, the last padded: (rows, index, how many are real)."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rcirl_jax.errors import extra_module
-from rcirl_jax.evaluation.baselines.tpe import new_study
+from rcirl_jax.evaluation.baselines import new_study
 from rcirl_jax.evaluation.ranking.metrics import METRICS
 from rcirl_jax.evaluation.ranking.sweep import (
     Point,

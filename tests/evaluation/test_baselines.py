@@ -1,4 +1,4 @@
-"""The tuned hand-set cost: the search, and what it minimises."""
+"""Tuned baselines: the searches, what they minimise, and their rows."""
 
 import functools
 
@@ -8,16 +8,23 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.baselines.cma_es import tune
-from rcirl_jax.evaluation.baselines.objectives import (
+from rcirl_jax.evaluation import baselines
+from rcirl_jax.evaluation.baselines import (
+    DRIVER,
     HAND_SET,
+    REACH,
+    TUNABLE_IDM,
     Problem,
     ValuedScenes,
+    as_numbers,
+    idm_of,
     learner_budget,
     mean_fde,
+    tune,
     valued_scenes,
 )
-from rcirl_jax.evaluation.ranking.score import candidates_key
+from rcirl_jax.evaluation.ranking.score import candidates_key, measure_scenes
+from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm, closeness, idm_trajectory
 from rcirl_jax.reward import (
     TUNABLE,
     TUNED_ROW,
@@ -29,7 +36,7 @@ from rcirl_jax.reward import (
 from rcirl_jax.reward.hand import LatticeTerms
 from rcirl_jax.sampling import SamplerConfig, num_candidates, sample
 from tests.evaluation.driven import mean_chosen_fde, scored_baselines
-from tests.helpers.scenes import T, unfused
+from tests.helpers.scenes import T, sampled, unfused
 from tests.helpers.stored import long_rows
 
 D = len(TUNABLE)
@@ -39,15 +46,15 @@ SCENES = 40
 INDEX = np.arange(SCENES)
 
 
-# ------------------------------------------------------------------ the search
+# ------------------------------------------------------------------ the searches
 
 
 class Counted:
     def __init__(self, function):
-        self.function, self.used = function, 0
+        self.function, self.seen = function, []
 
     def __call__(self, vectors):
-        self.used += len(vectors)
+        self.seen += list(vectors)
         return np.array([self.function(x) for x in vectors])
 
 
@@ -55,44 +62,62 @@ def sphere(x):
     return float(np.sum((x - np.arange(x.size) / 3.0) ** 2))
 
 
-def search(function, budget, seed=0, d=D):
-    return tune(function, np.zeros(d), 0.5, budget, seed)
+def search(function, budget, seed=0, d=D, by="cma"):
+    if by == "optuna":
+        pytest.importorskip("optuna")
+    return tune(function, np.zeros(d), 0.5, budget, seed, by)
 
 
-def test_it_finds_the_minimum_of_a_shifted_sphere():
-    counted = Counted(sphere)
-    best, value = search(counted, 1500)
+def test_cma_es_finds_the_minimum_of_a_shifted_sphere():
+    best, value = search(Counted(sphere), 1500)
     np.testing.assert_allclose(best, np.arange(D) / 3.0, atol=1e-3)
     assert value == sphere(best) < 1e-6
-    assert counted.used == 1500
 
 
-@pytest.mark.parametrize("budget", [1, 2, 10, 11, 12, 57])
-def test_it_takes_the_budget_and_never_more(budget):
+def test_tpe_comes_near_the_minimum_of_a_shifted_sphere_within_its_box():
     counted = Counted(sphere)
-    assert search(counted, budget)[1] <= sphere(np.zeros(D))
-    assert counted.used == budget
+    best, value = search(counted, 120, d=3, by="optuna")
+    assert value == sphere(best) < 0.3 * sphere(np.zeros(3))
+    assert np.abs(counted.seen).max() <= 0.5 * REACH
 
 
-def test_the_seed_alone_decides():
-    first = search(Counted(sphere), 90, seed=3)
+@pytest.mark.parametrize("by", ["cma", "optuna"])
+@pytest.mark.parametrize("budget", [1, 2, 10, 11, 12, 57])
+def test_it_takes_the_budget_and_never_more_from_the_start_on(budget, by):
+    counted = Counted(sphere)
+    assert search(counted, budget, by=by)[1] <= sphere(np.zeros(D))
+    assert len(counted.seen) == budget
+    np.testing.assert_array_equal(counted.seen[0], np.zeros(D))
+
+
+@pytest.mark.parametrize("by", ["cma", "optuna"])
+def test_the_seed_alone_decides(by):
+    first = search(Counted(sphere), 50, seed=3, by=by)
     np.random.seed(17)  # noqa: NPY002  # a state that must not matter
     before = np.random.get_state()[1].copy()  # noqa: NPY002
-    again = search(Counted(sphere), 90, seed=3)
+    again = search(Counted(sphere), 50, seed=3, by=by)
     np.testing.assert_array_equal(before, np.random.get_state()[1])  # noqa: NPY002
     np.testing.assert_array_equal(first[0], again[0])
-    assert search(Counted(sphere), 90, seed=4)[1] != first[1]
+    assert search(Counted(sphere), 50, seed=4, by=by)[1] != first[1]
 
 
-def test_nan_is_the_worst_and_flat_is_no_trap():
+@pytest.mark.parametrize("by", ["cma", "optuna"])
+def test_nan_is_the_worst_and_nothing_finite_is_refused(by):
+    walled = Counted(lambda x: sphere(x) if x[1] < 0.2 else np.nan)
+    best, value = search(walled, 60, by=by)
+    assert best[1] < 0.2
+    assert np.isfinite(value)
+    with pytest.raises(InputError, match="nowhere finite"):
+        search(Counted(lambda _: np.nan), 30, by=by)
+
+
+def test_a_wall_and_flat_ground_are_no_traps():
     """Where half the space is NaN the other half's minimum is found."""
     walled = Counted(lambda x: sphere(x) if x[1] < 0.2 else np.nan)
     assert search(walled, 900)[1] == pytest.approx((1.0 / 3.0 - 0.2) ** 2, rel=0.1)
     stepped = Counted(lambda x: np.floor(sphere(x) / 50.0))
     search(stepped, 300)
-    assert stepped.used == 300  # it starts again until the budget is spent
-    with pytest.raises(InputError, match="nowhere finite"):
-        search(Counted(lambda _: np.nan), 30)
+    assert len(stepped.seen) == 300  # it starts again until the budget is spent
 
 
 def test_an_equal_budget_is_in_queries():
@@ -223,3 +248,99 @@ def test_mean_fde_against_numpy_in_any_company():
     np.testing.assert_allclose(together, expected, atol=0.02)  # near ties
     np.testing.assert_array_equal(together[::-1], of(vectors[::-1]))
     np.testing.assert_array_equal(together[3:4], of(vectors[3:4]))
+
+
+# ------------------------------------------------------------------ the driver
+
+OF_DRIVER = 24
+DRIVEN = np.arange(OF_DRIVER)
+HIDDEN_DRIVER = np.array([0.5, 0.3, -0.8, -0.5, -0.4])
+
+
+@functools.cache
+def driven_by_a_hidden_driver():
+    """Demonstrations of 8 s whose human is the candidate nearest to a hidden driver."""
+    rows = long_rows(OF_DRIVER)
+    scenes = valued_scenes(DRIVER, rows, DRIVEN, SMALL, 8.0)
+    driver = idm_of(jnp.asarray(HIDDEN_DRIVER, jnp.float32))
+
+    def nearest(one):
+        scene, everyone, mask = one.known
+        way = idm_trajectory(scene, True, driver)
+        near = jax.vmap(lambda x: closeness(x, way, mask))(everyone)
+        best = jnp.argmax(jnp.where(one.feasible, near, -jnp.inf))
+        return jax.tree.map(lambda x: x[best], everyone)
+
+    human = jax.tree.map(np.asarray, jax.jit(jax.vmap(nearest))(scenes))
+    return rows.replace(human=human)
+
+
+def test_zeros_are_the_usual_driver_and_bounds_hold():
+    usual = idm_of(jnp.zeros(len(TUNABLE_IDM)))
+    for name, value in Idm().fields().items():
+        assert float(getattr(usual, name)) == float(value), name
+    wild = idm_of(jnp.full(len(TUNABLE_IDM), 50.0))
+    assert float(wild.headway) == pytest.approx(Idm().headway * np.exp(3.0))
+    assert float(wild.max_braking) == Idm().max_braking
+    (numbers,) = as_numbers([Idm(headway=1.2)])
+    assert numbers["headway"] == pytest.approx(1.2)
+    assert set(numbers) == set(Idm().fields())
+
+
+def test_the_search_comes_close_to_a_hidden_driver_by_what_the_report_measures():
+    rows, hidden = (
+        driven_by_a_hidden_driver(),
+        idm_of(jnp.asarray(HIDDEN_DRIVER, jnp.float32)),
+    )
+    tuned = {TUNED_IDM_ROW: hidden, "again": Idm(), "cost": LatticeCost()}
+    scored = scored_baselines(rows, SMALL, tuned)
+    np.testing.assert_allclose(
+        scored.values["again"], scored.values["IDM"], rtol=1e-5, atol=1e-4
+    )
+    np.testing.assert_allclose(
+        scored.values["cost"], scored.values["hand-set"], rtol=1e-5, atol=1e-3
+    )
+    found = [mean_chosen_fde(scored, name) for name in ("IDM", TUNED_IDM_ROW)]
+    scenes = valued_scenes(DRIVER, rows, DRIVEN, SMALL, 8.0)
+    both = np.stack([np.zeros(len(TUNABLE_IDM)), HIDDEN_DRIVER])
+    usual, hidden = mean_fde(DRIVER, scenes, both)
+    np.testing.assert_allclose(found, [usual, hidden], atol=0.05)
+    assert hidden < 0.05
+    _, best = tune(lambda x: mean_fde(DRIVER, scenes, x), both[0], 1.0, 200, 0)
+    assert best < 0.5 * usual
+
+
+def test_the_search_that_is_asked_for_is_taken(monkeypatch):
+    seen = []
+
+    def proposed(start, at_start, sigma, seed):
+        seen.append((start.size, at_start, sigma, seed))
+        while True:
+            yield np.array([HIDDEN_DRIVER])
+
+    monkeypatch.setitem(baselines.SEARCHES, "optuna", proposed)
+    far = lambda vectors: -np.abs(vectors).sum(axis=1)  # noqa: E731
+    made = Problem(objective=far, queries=1)
+    best = baselines._best(DRIVER, made, 7, 3, "optuna")
+    assert seen == [(len(TUNABLE_IDM), 0.0, baselines.SIGMA, 3)]
+    assert best.fields() == idm_of(jnp.asarray(HIDDEN_DRIVER, jnp.float32)).fields()
+
+
+def test_candidates_are_those_of_the_evaluation():
+    rows = driven_by_a_hidden_driver()
+    scenes = valued_scenes(DRIVER, rows, DRIVEN, SMALL, 8.0)
+    one = jax.tree.map(lambda x: jnp.asarray(x[3]), rows.scene)
+    expected = sampled(candidates_key(jnp.asarray(3)), one, SMALL).trajectory
+    np.testing.assert_allclose(scenes.known[1].s[3], expected.s, atol=1e-3)
+
+
+def test_distances_alone_are_those_of_the_scores():
+    """What an import's oracle floor measures, over a padded chunk."""
+    rows = driven_by_a_hidden_driver()
+    scored = scored_baselines(rows, SMALL, {})
+    near = measure_scenes(
+        rows, DRIVEN, sampler=SMALL, horizon_s=8.0, futures="recorded"
+    )
+    for name in ("feasible", "fde", "ade"):
+        found, wanted = getattr(near, name), getattr(scored, name)
+        np.testing.assert_allclose(found, wanted, atol=1e-4)
