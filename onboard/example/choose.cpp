@@ -2,7 +2,7 @@
 //
 // CANDIDATES is float32 numbers in this machine's byte order, [K, T, F] with the last
 // axis fastest; the sizes T and F are those of the weights file. COSTS is [K] alike, the
-// planner's own costs, lower is better: an anchored reward is added to them.
+// planner's own costs, lower is better: a reward with a prior cost is added to them.
 #include <cstdio>
 #include <vector>
 
@@ -31,10 +31,10 @@ int main(int count, char** arguments) {
     std::fprintf(stderr, "%s\n", status.message().c_str());
     return 2;
   }
-  if (reward.anchored() != (count == 3)) {
-    std::fprintf(stderr, "%s: anchor: %s: expected %s\n", arguments[1],
-                 reward.anchored() ? reward.incumbent().c_str() : "none",
-                 reward.anchored() ? "COSTS as a second argument, those of the planner"
+  if (reward.has_prior_cost() != (count == 3)) {
+    std::fprintf(stderr, "%s: prior_cost: %s: expected %s\n", arguments[1],
+                 reward.has_prior_cost() ? reward.incumbent().c_str() : "none",
+                 reward.has_prior_cost() ? "COSTS as a second argument, those of the planner"
                                    : "no COSTS, for the reward decides alone");
     return 2;
   }
@@ -49,7 +49,7 @@ int main(int count, char** arguments) {
   rcirl::Workspace workspace = reward.workspace();
   std::vector<float> values(candidates);
   std::size_t refused = 0;
-  if (reward.anchored()) {
+  if (reward.has_prior_cost()) {
     std::FILE* file = std::fopen(arguments[2], "rb");
     std::vector<float> own = file != nullptr ? numbers(file) : std::vector<float>();
     if (file != nullptr) std::fclose(file);

@@ -53,8 +53,8 @@ int main(int count, char** arguments) {
   columns.compute(scene, {s.data(), nullptr, 10}, features.data());
   const rcirl::Mask valid = columns.mask(scene);
   float *const at = features.data(), *const to = values.data();
-  if (!reward.anchored()) reward.score(at, 10, valid, &workspace, to);
-  if (reward.anchored()) reward.total(at, 10, valid, own.data(), &workspace, to);
+  if (!reward.has_prior_cost()) reward.score(at, 10, valid, &workspace, to);
+  if (reward.has_prior_cost()) reward.total(at, 10, valid, own.data(), &workspace, to);
   for (std::size_t k = 0; k < 10; ++k) std::printf("candidate %zu: %.9g\n", k, double{values[k]});
   std::printf("best: candidate %zu\n", rcirl::best(values.data(), 10));
 }

@@ -52,9 +52,7 @@ a = -3.0 + 0.5 * np.arange(10)[:, None]  # m/s^2, held until the ego stands
 t = np.minimum(TIMES, SPEED / np.maximum(-a, 1e-9))
 s = SPEED * t + 0.5 * a * t * t  # [10, T] m along the given path
 found, valid = columns(scene, s), scene.time_valid
-own = -np.abs(
-    a[:, 0]
-)  # of a reward with a prior cost: your planner's own costs, negated
+own = -np.abs(a[:, 0])  # for a prior cost: your planner's own costs, negated
 alone = reward.prior_cost is None
 values = reward.value(found, valid) if alone else reward.total(found, own, valid)
 for number, value in enumerate(values):

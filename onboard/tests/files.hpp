@@ -64,9 +64,9 @@ inline std::string filled(const std::vector<std::size_t>& shape, float value) {
 }
 
 // A file with this body and the right hash.
-inline std::string sealed(const std::string& body, std::uint64_t version = 1) {
+inline std::string sealed(const std::string& body) {
   return map({{"magic", text("RCIRLW")},
-              {"schema_version", natural(version)},
+              {"schema_version", natural(1)},
               {"body", bytes(body)},
               {"sha256", text(rcirl::detail::sha256_hex(body.data(), body.size()))}});
 }
@@ -187,6 +187,8 @@ struct Example {
     }
     std::vector<float> grid(times);
     for (std::size_t t = 0; t < times; ++t) grid[t] = 0.5f * static_cast<float>(t);
+    std::vector<float> ends(2 * size, 1.0f);  // of the training's range
+    std::fill_n(ends.begin(), size, -1.0f);
     std::vector<std::pair<std::string, std::string>> fields = {
         {"preset", pack::text("test")},
         {"features", pack::list(columns)},
@@ -194,15 +196,17 @@ struct Example {
                                   {"upper", pack::array({size}, upper)},
                                   {"location", pack::array({size}, location)},
                                   {"scale", pack::array({size}, scale)}})},
+        {"training_range", pack::array({2, size}, ends)},
         {"times", pack::array({times}, grid)},
         {"gamma", pack::array({times}, gamma)},
         {"layers", pack::list(layers)},
         {"activation", pack::text(activation)},
         {"leaky_slope", pack::real(0.01)},
+        {"scene_gating", by_context ? pack::array({size, size}, context) : pack::nil()},
+        {"prior_cost", pack::nil()},
         {"loss", pack::map({{"name", pack::text("rank")}, {"leaky_rate", pack::nil()}})},
         {"provenance", pack::map({{"seed", pack::natural(7)}})},
-        {"samples", sample_fields()}};
-    if (by_context) fields.push_back({"context", pack::array({size, size}, context)});
+        {"samples", sample_fields(pack::nil())}};
     return fields;
   }
 
@@ -212,7 +216,7 @@ struct Example {
                       {"none_value", pack::natural(100)}});
   }
 
-  std::string sample_fields() const {
+  std::string sample_fields(const std::string& gains) const {
     const std::vector<float> raw = inputs(samples, seed + 1);
     std::vector<float> values(samples);
     for (std::size_t i = 0; i < samples; ++i) {
@@ -220,10 +224,11 @@ struct Example {
     }
     return pack::map({{"features", pack::array({samples, times, features}, raw)},
                       {"valid", pack::filled({samples, times}, 1.0f)},
-                      {"value", pack::array({samples}, values)}});
+                      {"value", pack::array({samples}, values)},
+                      {"gain", gains}});
   }
 
-  std::string file() const { return pack::sealed(pack::map(body()), by_context ? 2 : 1); }
+  std::string file() const { return pack::sealed(pack::map(body())); }
 
   // The file with one field replaced (added if it is new), and the right hash.
   std::string tampered(const std::string& key, const std::string& bytes) const {
@@ -235,7 +240,7 @@ struct Example {
     } else {
       fields.push_back({key, bytes});
     }
-    return pack::sealed(pack::map(fields), by_context ? 2 : 1);
+    return pack::sealed(pack::map(fields));
   }
 };
 

@@ -30,7 +30,7 @@ void test_a_file_and_what_it_says() {
   const Example example(3, 4, {5}, "tanh", true);
   rcirl::Reward reward;
   CHECK_TEXT(rcirl::decode(example.file(), "w", &reward).message(), "");
-  CHECK(reward.version() == 2 && reward.preset() == "test" && reward.file() == "w");
+  CHECK(reward.preset() == "test" && reward.file() == "w");
   CHECK(reward.sha256().size() == 64);
   CHECK(reward.times() == std::vector<float>({0.0f, 0.5f, 1.0f, 1.5f}));
   CHECK(reward.features().size() == 3 && reward.features()[1].name == "feature1");
@@ -89,7 +89,9 @@ void test_fields() {
   is("provenance", pack::map({{"x", pack::real(infinity)}}), "provenance: inf");
   is("samples", pack::map({}), "samples.features: missing");
   is("extra", pack::nil(), "body.extra: unknown: expected the keys preset, features");
-  is("context", pack::nil(), "body.context: unknown");
+  is("training_range", pack::filled({1, 3}, 1.0f), "training_range.shape: [1, 3]: expected");
+  is("scene_gating", pack::filled({1, 3}, 1.0f), "scene_gating.shape: [1, 3]: expected [3, 3]");
+  is("prior_cost", pack::map({}), "prior_cost.incumbent: missing");
 }
 
 void test_arrays() {
@@ -175,11 +177,8 @@ void test_the_outer_map() {
   expect("\x81\x01\x01", "file: a key that is no text" + whole);
   expect(std::string("\x82\xa1" "a\x01\xa1" "a\x02"), "file: a key used twice" + whole);
   expect(outer("magic", pack::text("RCIRLX")), "magic: missing or another");
-  expect(outer("schema_version", pack::natural(5)), "schema_version: 5: expected 1, 2, 3 or 4");
-  expect(outer("schema_version", pack::natural(4)), "body.seen: missing");
-  expect(outer("schema_version", pack::natural(3)), "body.seen: missing");
+  expect(outer("schema_version", pack::natural(2)), "schema_version: 2: expected 1, all");
   expect(outer("schema_version", pack::boolean(true)), "schema_version: True");
-  expect(outer("schema_version", pack::natural(2)), "body.context: missing");
   expect(outer("sha256", pack::text(std::string(64, '0'))), "sha256: ");
   expect(outer("sha256", pack::text("no bytes")), "sha256: ");
   expect(outer("body", pack::text("text")), "sha256: no bytes");
@@ -214,7 +213,8 @@ void test_samples() {
     return e.tampered("samples",
                       pack::map({{"features", pack::array({m, e.times, e.features}, raw)},
                                  {"valid", valid},
-                                 {"value", pack::array({m}, values)}}));
+                                 {"value", pack::array({m}, values)},
+                                 {"gain", pack::nil()}}));
   };
   const std::string ones = pack::filled({3, 4}, 1.0f);
   CHECK_TEXT(refusal(with(ones, {5e-6f, -5e-6f, 0.0f}, 3)), "taken");
@@ -226,7 +226,8 @@ void test_samples() {
   expect(gated.tampered("samples",
                         pack::map({{"features", pack::filled({1, 4, 3}, 0.5f)},
                                    {"valid", late},
-                                   {"value", pack::filled({1}, 0.0f)}})),
+                                   {"value", pack::filled({1}, 0.0f)},
+                                   {"gain", pack::nil()}})),
          "samples.valid[0, 0]: 0: expected 1 at the first time");
 }
 

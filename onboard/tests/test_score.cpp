@@ -9,7 +9,7 @@
 #include <thread>
 #include <vector>
 
-#include "anchored.hpp"
+#include "with_prior_cost.hpp"
 #include "check.hpp"
 #include "rcirl/guard.hpp"
 #include "rcirl/reward.hpp"
@@ -217,11 +217,11 @@ void test_check_features() {
 }
 
 void test_scoring_allocates_nothing() {
-  const Anchored anchored(Example(21, 18, {32, 16}, "tanh", true));
+  const WithPriorCost with_prior_cost(Example(21, 18, {32, 16}, "tanh", true));
   rcirl::Reward reward;
-  CHECK_TEXT(rcirl::decode(anchored.file(), "w", &reward).message(), "");
+  CHECK_TEXT(rcirl::decode(with_prior_cost.file(), "w", &reward).message(), "");
   rcirl::Workspace workspace = reward.workspace();
-  const std::vector<float> features = anchored.example.inputs(100, 3);
+  const std::vector<float> features = with_prior_cost.example.inputs(100, 3);
   std::vector<float> values(100);
   const rcirl::Guard guard(reward);
   const long before = allocations;

@@ -6,8 +6,8 @@
     rcirl export --run=RUN --stablehlo=FILE
 
 The file carries verification samples from the dataset's training split; a reader
-recomputes them before it accepts the file. The ranges are for the guard
-(docs/guard.md); a reader that knows schema versions 1 and 2 only takes --noranges.
+recomputes them before it accepts the file. It also records the range of each feature in
+training, for the guard (docs/guard.md).
 
 Other forms are for planners that read neither it nor Python (--onnx and --jax_export
 need the extra [export]). Each scores as the file does, and FILE.json beside it says
@@ -37,21 +37,13 @@ from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
 
-USUAL = (
-    *("run", "weights", "output", "data", "onnx", "stablehlo", "jax_export", "yaml"),
-    "ranges",
-)
+USUAL = ("run", "weights", "output", "data", "onnx", "stablehlo", "jax_export", "yaml")
 _RUN = flags.DEFINE_string("run", None, "run to export: a folder of `rcirl train`")
 _WEIGHTS = flags.DEFINE_string(
     "weights", None, "instead: a weights file, to write in other forms"
 )
 _DATA = flags.DEFINE_list(
     "data", None, "datasets, where they have moved (default: those of the run)"
-)
-_RANGES = flags.DEFINE_bool(
-    "ranges",
-    True,
-    "record what training saw of each feature, for the guard; none for old readers",
 )
 _OUTPUT = flags.DEFINE_string(
     "output", None, "weights file to write (default: RUN/weights.msgpack)"
@@ -92,7 +84,7 @@ def main() -> None:
         output = Path(_OUTPUT.value or workdir / "weights.msgpack")
         dataset = open_datasets(_DATA.value or datasets_of(workdir))
         dataset = with_tags(dataset, tags_of(workdir))
-        reward = export_run(workdir, dataset, output, ranges=_RANGES.value)
+        reward = export_run(workdir, dataset, output)
         print(f"{output}: {len(reward.names)} features, sha256 {reward.sha256[:16]}...")
 
 

@@ -1,6 +1,6 @@
 """The exported reward: one file of weights, its writer and its reader."""
 
-from rcirl_jax.export.guard import Guard, Limits, Verdict
+from rcirl_jax.export.guard import Guard, GuardResult, Limits
 from rcirl_jax.export.reader import (
     PriorCost,
     Reward,
@@ -21,11 +21,11 @@ __all__ = [
     "PROVENANCE_KEYS",
     "FeatureSpec",
     "Guard",
+    "GuardResult",
     "Limits",
     "PriorCost",
     "Reward",
     "RewardWeights",
-    "Verdict",
     "WeightsError",
     "decode_weights",
     "load_weights",

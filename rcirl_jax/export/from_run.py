@@ -89,7 +89,7 @@ def reward_weights(
     normaliser: Normaliser,
     config: TrainConfig,
     provenance: dict,
-    seen: np.ndarray | None = None,
+    seen: np.ndarray,
     *,
     prior_cost: PriorCost | None = None,
 ) -> RewardWeights:
@@ -128,7 +128,6 @@ def export_run(
     dataset: Demonstrations,
     output: Path,
     *,
-    ranges: bool = True,
     prior_cost: PriorCost | None = None,
 ) -> Reward:
     """Write weights.msgpack from a run's newest checkpoint.
@@ -140,9 +139,7 @@ def export_run(
       workdir: run folder of `rcirl train`.
       dataset: the dataset of the run (its hash has to match).
       output: file to write, atomically.
-      ranges: record what the training saw of each feature (schema version 3), from
-        the scenes that fitted the normaliser.
-      prior_cost: of a reward driven on top of an incumbent (needs the ranges).
+      prior_cost: of a reward driven on top of an incumbent.
 
     Raises:
       InputError: no run, no checkpoint, another dataset, or another network than
@@ -155,10 +152,9 @@ def export_run(
             f"expected that of the given dataset, {dataset.hash}"
         )
     config.reward.check_own()
-    state, seen = restore_run(workdir, config), None
-    if ranges:
-        rows = normaliser_rows(dataset, config)
-        seen = seen_range(rows, feature_map(config.features))
+    state = restore_run(workdir, config)
+    rows = normaliser_rows(dataset, config)
+    seen = seen_range(rows, feature_map(config.features))
     return write_weights(
         output,
         cast("RewardParams", state.params),
@@ -178,7 +174,7 @@ def write_weights(
     config: TrainConfig,
     samples: tuple[np.ndarray, np.ndarray],
     provenance: dict,
-    seen: np.ndarray | None = None,
+    seen: np.ndarray,
     *,
     prior_cost: PriorCost | None = None,
 ) -> Reward:
@@ -192,7 +188,7 @@ def write_weights(
       samples: of `verification_samples`; their values are computed here as the
         trainer computes them.
       provenance: `weights.PROVENANCE_KEYS` and more.
-      seen: [2, F] of `seen_range`, if known.
+      seen: [2, F] of `seen_range`.
       prior_cost: of a reward driven on top of an incumbent.
     """
     x, valid = map(jnp.asarray, samples)

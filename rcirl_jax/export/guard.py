@@ -3,10 +3,8 @@
 May be copied into a planner's repository beside `reader.py`. docs/guard.md says what
 it can tell; the rule is
 
-    [first, last] = [seen_0, seen_1]                       with the file's `seen`
-                  = [location - reach scale, location + reach scale]      without
-    low  = -inf if first <= lower, else first - margin scale   margin 0 without `seen`
-    high = +inf if last >= upper, else last + margin scale
+    low  = -inf if first <= lower, else first - margin scale   [first, last]: the
+    high = +inf if last >= upper, else last + margin scale         training's range
     share_i = share of the raw entries f_ti of feature i, over all candidates and
               valid times, that lie outside [low_i, high_i] or are not finite
 
@@ -31,14 +29,12 @@ class Limits:
 
     # scales by which the recorded range of a feature is widened on each side
     margin: float = 0.25
-    # scales around the location, for files without recorded ranges
-    reach: float = 3.0
     # largest share of a feature's entries that may lie outside
     share: float = 0.25
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Verdict:
+class GuardResult:
     """What the guard says of one plan."""
 
     in_distribution: bool
@@ -50,18 +46,13 @@ class Verdict:
 
 @np.errstate(over="ignore")
 def bounds(reward: Any, limits: Limits) -> tuple[np.ndarray, np.ndarray]:  # noqa: ANN401
-    """Lowest and highest value in distribution, float32 [F], in the feature's unit.
+    """Return the lowest and highest value in distribution, float32 [F].
 
-    `reward` is a `reader.Reward`, whose file this one does not need.
-
-    An infinite one is an open side.
+    `reward` is a `reader.Reward`, whose file this one does not need. An infinite end
+    is an open side.
     """
-    scale = np.asarray(reward.scale, np.float64)
-    if reward.seen is None:
-        location, reach = np.asarray(reward.location, np.float64), limits.reach * scale
-        ends, margin = np.stack([location - reach, location + reach]), 0.0
-    else:
-        ends, margin = np.asarray(reward.seen, np.float64), limits.margin * scale
+    margin = limits.margin * np.asarray(reward.scale, np.float64)
+    ends = np.asarray(reward.seen, np.float64)
     first, last = ends.astype(np.float32)
     lower, upper = (np.asarray(x, np.float32) for x in (reward.lower, reward.upper))
     # a value at its cap may lie anywhere beyond; what never varied has no cap
@@ -80,15 +71,15 @@ class Guard:
 
     @property
     def blind(self) -> tuple[str, ...]:
-        """Features with both sides open: only what is not finite is noticed."""
+        """Return features with both sides open: only what is not finite is noticed."""
         both = np.isneginf(self.low) & np.isposinf(self.high)
         names = zip(self.reward.names, both, strict=True)
         return tuple(name for name, is_open in names if is_open)
 
     def check(
         self, features: np.ndarray, time_valid: np.ndarray | None = None
-    ) -> Verdict:
-        """The verdict on one plan.
+    ) -> GuardResult:
+        """Return the verdict on one plan.
 
         Args:
           features: [..., T, F] raw features of all its candidates.
@@ -116,7 +107,7 @@ class Guard:
         shares = outside / count if count else np.ones(given.shape[-1])
         worst = int(np.argmax(np.where(unknown, shares + 2.0, shares)))
         fine = not unknown.any() and bool(shares[worst] <= self.limits.share)
-        return Verdict(
+        return GuardResult(
             in_distribution=fine,
             feature=self.reward.names[worst],
             share=float(shares[worst]),
@@ -127,8 +118,8 @@ class Guard:
         features: np.ndarray,
         incumbent: np.ndarray,
         time_valid: np.ndarray | None = None,
-    ) -> tuple[int, Verdict]:
-        """The candidate to drive: the reward's, or the incumbent's out of distribution.
+    ) -> tuple[int, GuardResult]:
+        """Return the candidate to drive: the incumbent's out of distribution.
 
         Args:
           features: [K, T, F] raw features of the candidates.

@@ -30,7 +30,7 @@ _SAID: dict[str, type] = {
 
 
 def open_reward(path: str) -> Reward:
-    """A weights file whose features are those this package computes.
+    """Read a weights file whose features are those this package computes.
 
     Raises:
       InputError: unreadable or damaged file, other features or units, or a
@@ -46,7 +46,7 @@ def open_reward(path: str) -> Reward:
 
 
 def features_of(reward: Reward) -> FeatureMap:
-    """The features that a reward reads, as this package computes them.
+    """Return the features that a reward reads, as this package computes them.
 
     Raises:
       InputError: it computes others, or with other units.
@@ -120,14 +120,14 @@ def familiarity_of(prior_cost: PriorCost) -> Familiarity:
 
 
 def scorer_of(reward: Reward) -> Scorer | OnTop:
-    """The reward as a row of ranking tables: V, on top of its prior cost if any."""
+    """Return the reward as a row of rankings: V, on top of its prior cost if any."""
     if reward.prior_cost is None:
         return reward.value
     return OnTop(incumbent=reward.prior_cost.incumbent, total=reward.total)
 
 
 def compiled_scorer(reward: Reward) -> Scorer:
-    """`reward.value` as a compiled program, one for all rewards of a shape.
+    """Return `reward.value` as a compiled program, one for all rewards of a shape.
 
     Can be sent to other processes. For calls with up to 32,768 trajectories: see
     BUILD.md on jaxlib's sums.
@@ -158,7 +158,7 @@ def _value(
 
 
 def row_name(reward: Reward) -> str:
-    """Name of a reward's row in the tables: loss and network."""
+    """Return the name of a reward's row in the tables: loss and network."""
     hidden = [str(kernel.shape[1]) for kernel in reward.kernels[:-1]]
     shape = f"{len(reward.names)}-{'-'.join([*hidden, '1'])}"
     name = {
@@ -175,8 +175,21 @@ def row_name(reward: Reward) -> str:
     return f"{words} {shape if hidden else 'linear'}{by_scene}{on}"
 
 
+def _seed(reward: Reward) -> int:
+    return int(reward.provenance.get("seed") or 0)
+
+
+def _rows(rewards: Sequence[Reward]) -> list[tuple[str, bool, bool]]:
+    """Return (row name, shared with others, those have a seed each) per reward."""
+    names = [row_name(reward) for reward in rewards]
+    seeds: dict[str, list[int]] = {}
+    for name, reward in zip(names, rewards, strict=True):
+        seeds.setdefault(name, []).append(_seed(reward))
+    return [(n, len(seeds[n]) > 1, len({*seeds[n]}) == len(seeds[n])) for n in names]
+
+
 def row_names(rewards: Sequence[Reward]) -> list[str]:
-    """Names of rewards that have a row each: loss, network, and what tells them apart.
+    """Return names of rewards that have a row each: loss, network, what differs.
 
     Those of one loss and network are told apart by their seeds or, where two have the
     same seed, by their files.
@@ -185,19 +198,16 @@ def row_names(rewards: Sequence[Reward]) -> list[str]:
       InputError: a file twice.
     """
     short = short_names([reward.file for reward in rewards])
-    groups = _by_row(rewards)
-    names = []
-    for reward, file in zip(rewards, short, strict=True):
-        name = row_name(reward)
-        if len(groups[name]) > 1:
-            own = f"seed {_seed(reward)}" if _are_seeds(groups[name]) else file
-            name = f"{name} ({own})"
-        names.append(name)
-    return names
+    found = []
+    for reward, file, row in zip(rewards, short, _rows(rewards), strict=True):
+        name, shared, by_seed = row
+        own = f"seed {_seed(reward)}" if by_seed else file
+        found.append(f"{name} ({own})" if shared else name)
+    return found
 
 
 def short_names(files: Sequence[str]) -> list[str]:
-    """The names of files, with as many folders before them as tell them apart.
+    """Return names of files, with as many folders before them as tell them apart.
 
     Raises:
       InputError: a file twice.
@@ -215,25 +225,8 @@ def short_names(files: Sequence[str]) -> list[str]:
     return names
 
 
-def _by_row(rewards: Sequence[Reward]) -> dict[str, list[Reward]]:
-    """The rewards of each loss and network."""
-    groups: dict[str, list[Reward]] = {}
-    for reward in rewards:
-        groups.setdefault(row_name(reward), []).append(reward)
-    return groups
-
-
-def _seed(reward: Reward) -> int:
-    return int(reward.provenance.get("seed") or 0)
-
-
-def _are_seeds(group: Sequence[Reward]) -> bool:
-    """Whether the rewards of a row have a seed each."""
-    return len(set(map(_seed, group))) == len(group)
-
-
 def prior_cost_words(name: str, reward: Reward) -> str:
-    """One sentence on what a reward with a prior cost drives by; "" of another one."""
+    """Return a sentence on what a prior cost does to a reward; "" without one."""
     prior_cost = reward.prior_cost
     if prior_cost is None:
         return ""
@@ -248,7 +241,7 @@ def prior_cost_words(name: str, reward: Reward) -> str:
 def load_runs(
     paths: Sequence[str],
 ) -> tuple[dict[str, list[Scorer | OnTop]], str, SamplerConfig]:
-    """Scorers by row (files of one loss and shape are its seeds).
+    """Return scorers by row (files of one loss and shape are its seeds).
 
     Where two of them have the same seed, each file is a row, as `row_names` has it.
 
@@ -265,9 +258,9 @@ def load_runs(
         )
     preset, mode = settings.pop()
     runs: dict[str, list[Scorer | OnTop]] = {}
-    groups = _by_row(rewards)
-    for reward, own in zip(rewards, row_names(rewards), strict=True):
-        name = row_name(reward)
-        name = name if _are_seeds(groups[name]) else own
-        runs.setdefault(name, []).append(scorer_of(reward))
+    for reward, own, row in zip(
+        rewards, row_names(rewards), _rows(rewards), strict=True
+    ):
+        name, _, by_seed = row
+        runs.setdefault(name if by_seed else own, []).append(scorer_of(reward))
     return runs, preset, SamplerConfig(mode=mode)

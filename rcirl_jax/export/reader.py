@@ -4,11 +4,12 @@ This one file may be copied into a planner's repository. docs/weights_format.md
 gives the byte layout; the equation is
 
     x_t = (clip(f_t, lower, upper) - location) / scale       f [T, F]
-    x_t <- x_t * 2 / (1 + exp(-x_0 C))                       with a context only
+    x_t <- x_t * 2 / (1 + exp(-x_0 C))                       with scene gating only
     r_t = act(... act(x_t W_1 + b_1) ...) W_L + b_L          last layer linear
     V   = sum_t gamma_t * time_valid_t * r_t                 higher is better
 
-A reward with a prior cost (schema version 4) is driven on the planner's own cost:
+A reward with a prior cost is driven on the planner's own cost, with a gain that
+depends on how familiar the scene is:
 
     V_total = V_incumbent + gain V
     gain    = low + (high - low) sigmoid(out . tanh(z W + b) + c)
@@ -31,7 +32,7 @@ import msgpack
 import numpy as np
 
 MAGIC = "RCIRLW"  # first value of the outer map
-SCHEMA_VERSIONS = (1, 2, 3, 4)  # the layouts this reader knows
+SCHEMA_VERSION = 1  # the layout that this reader knows
 TOLERANCE = 1e-5  # of max(1, |V|), on a verification sample, float32; of gains too
 REACH = 5.0  # scales from the location beyond which a prior cost's inputs are clipped
 
@@ -50,12 +51,14 @@ MAX_DEPTH = 8  # levels of lists and maps, `provenance` itself the first
 
 OUTER_KEYS = ("magic", "schema_version", "body", "sha256")
 RANGES = ("lower", "upper", "location", "scale")
-GRID_KEYS = ("preset", "features", "normaliser", "times", "gamma")
-NETWORK_KEYS = ("layers", "activation", "leaky_slope")
-PRIOR_COST_NUMBERS = ("low", "high")
-PRIOR_COST_ARRAYS = ("location", "scale", "kernel", "bias", "out", "offset")
-PRIOR_COST_KEYS = ("incumbent", *PRIOR_COST_NUMBERS, *PRIOR_COST_ARRAYS, "gain")
-BODY_KEYS = (*GRID_KEYS, *NETWORK_KEYS, "loss", "provenance", "samples")
+FAMILIARITY_KEYS = ("location", "scale", "kernel", "bias", "out", "offset")
+PRIOR_COST_KEYS = ("incumbent", "low", "high", "familiarity")
+SAMPLE_KEYS = ("features", "valid", "value", "gain")
+BODY_KEYS = (
+    *("preset", "features", "normaliser", "training_range", "times", "gamma"),
+    *("layers", "activation", "leaky_slope", "scene_gating", "prior_cost"),
+    *("loss", "provenance", "samples"),
+)
 ACTIVATIONS: dict[str, Callable[[np.ndarray, np.float32], np.ndarray]] = {
     "tanh": lambda x, slope: np.tanh(x),
     "relu": lambda x, slope: np.maximum(x, np.float32(0.0)),
@@ -74,7 +77,7 @@ class WeightsError(ValueError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class PriorCost:
-    """How much of V is added to the incumbent's value; the equation stands above."""
+    """How much of V is added to the incumbent's value, by the scene's familiarity."""
 
     incumbent: str  # whose value V is added to, at most 64 characters
     low: float  # gain where the training data do not reach, >= 0
@@ -123,15 +126,15 @@ class Reward:
     biases: tuple[np.ndarray, ...]  # [H1], ..., [1]
     activation: str
     leaky_slope: float  # negative slope of "leaky_relu"
-    context: np.ndarray | None  # [F, F] C, gains by the scene
-    seen: np.ndarray | None  # [2, F] ends of the training's range, from version 3
-    prior_cost: PriorCost | None  # version 4: drives on top of an incumbent, by `total`
+    context: np.ndarray | None  # [F, F] C, the scene gating
+    seen: np.ndarray  # [2, F] ends of the training's range
+    prior_cost: PriorCost | None  # drives on top of an incumbent, by `total`
     loss: dict[str, Any]
     provenance: dict[str, Any]
 
     @property
     def unsupported(self) -> tuple[str, ...]:
-        """Features without effect: the training never saw them vary."""
+        """Return features without effect: the training never saw them vary."""
         empty = zip(self.names, self.lower >= self.upper, strict=True)
         return tuple(name for name, none in empty if none)
 
@@ -146,7 +149,7 @@ class Reward:
     def value(
         self, features: np.ndarray, time_valid: np.ndarray | None = None
     ) -> np.ndarray:
-        """V of trajectories; higher is better.
+        """Return V of trajectories; higher is better.
 
         Args:
           features: [..., T, F] raw features at `times`.
@@ -156,7 +159,7 @@ class Reward:
         Returns:
           float32 [...]. A value that is not finite raises: `argmax` would pick a
           NaN. Features at times that are not valid may be anything. The first time
-          has to be valid in a conditioned reward (`context`): it sets the gains.
+          has to be valid in a reward with scene gating: it sets the gates.
         """
         numbers = self._numbers(features, (len(self.times), len(self.names)))
         valid = None if time_valid is None else self._mask(time_valid, numbers.shape)
@@ -165,7 +168,7 @@ class Reward:
         return self._finite("value", self._values(numbers, valid), "finite features")
 
     def gain(self, features: np.ndarray) -> np.ndarray:
-        """How much of V a reward with a prior cost adds to the incumbent's value.
+        """Return how much of V is added to the value of the prior cost.
 
         Args:
           features: [..., T, F] raw features at `times`; the first time counts.
@@ -175,7 +178,7 @@ class Reward:
           among the features that matter (whose row of the kernel is not 0).
         """
         if self.prior_cost is None:
-            _fail(f"{self.file}: anchor", "missing", "a reward with a prior cost")
+            _fail(f"{self.file}: prior_cost", None, "a reward with a prior cost")
         numbers = self._numbers(features, (len(self.times), len(self.names)))
         gains = self.prior_cost.gain(numbers[..., 0, :])
         return self._finite("gain", gains, "finite features at the first time")
@@ -186,7 +189,7 @@ class Reward:
         incumbent: np.ndarray,
         time_valid: np.ndarray | None = None,
     ) -> np.ndarray:
-        """V_incumbent + gain V of trajectories; higher is better.
+        """Return V_incumbent + gain V of trajectories; higher is better.
 
         Args:
           features: as `value`.
@@ -222,7 +225,7 @@ class Reward:
 
     def _needs_first(self, valid: np.ndarray) -> None:
         if not valid[..., 0].all():
-            _fail(f"{self.file}: time_valid", "0 at the first time", "1: gains need it")
+            _fail(f"{self.file}: time_valid", "0 at the first time", "1: gates need it")
 
     @np.errstate(all="ignore")
     def _values(self, features: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
@@ -268,7 +271,7 @@ class Reward:
 
 
 def load_weights(path: str | os.PathLike[str]) -> Reward:
-    """Read and verify one file, schema version 1, 2, 3 or 4.
+    """Read and verify one file.
 
     Raises:
       WeightsError: the file is missing, damaged, of another version, out of
@@ -308,26 +311,21 @@ def _decode(data: bytes, file: str) -> Reward:
     if not isinstance(outer, dict) or outer.get("magic") != MAGIC:
         _fail("magic", "missing or another", repr(MAGIC))
     version = outer.get("schema_version")
-    if type(version) is not int or version not in SCHEMA_VERSIONS:
-        _fail("schema_version", version, "1, 2, 3 or 4, all this reader supports")
+    if type(version) is not int or version != SCHEMA_VERSION:
+        _fail("schema_version", version, f"{SCHEMA_VERSION}, all this reader supports")
     _map("file", outer, OUTER_KEYS)
     body = outer["body"]
     found = hashlib.sha256(body).hexdigest() if isinstance(body, bytes) else "no bytes"
     if outer["sha256"] != found or not isinstance(body, bytes):
         _fail("sha256", found, f"{_show(outer['sha256'])}; the file is damaged")
-    unpacked = _unpack("body", body)
-    more = ((), ("context",), ("seen",), ("seen", "anchor"))[version - 1]
-    keys = (*BODY_KEYS, *more)
-    if version >= 3 and isinstance(unpacked, dict) and "context" in unpacked:
-        keys += ("context",)
-    fields = _map("body", unpacked, keys)
+    fields = _map("body", _unpack("body", body), BODY_KEYS)
     reward = Reward(file=file, sha256=found, **_fields(fields))
-    _verify(reward, fields["samples"], fields.get("anchor"))
+    _verify(reward, fields["samples"])
     return reward
 
 
 def _fields(body: dict[str, Any]) -> dict[str, Any]:
-    """Every field of `Reward` that comes from the body, checked."""
+    """Return every field of `Reward` that comes from the body, checked."""
     features = _features(body["features"])
     size = len(features["names"])
     boxes = _map("normaliser", body["normaliser"], RANGES)
@@ -341,14 +339,11 @@ def _fields(body: dict[str, Any]) -> dict[str, Any]:
     activation = _text("activation", body["activation"])
     if activation not in ACTIVATIONS:
         _fail("activation", activation, f"one of {', '.join(ACTIVATIONS)}")
-    context = body.get("context")
-    if "context" in body:
-        context = _array("context", context, (size, size))
-    seen = body.get("seen")
-    if "seen" in body:
-        seen = _array("seen", seen, (2, size))
-        _every("seen", seen[:1], seen[:1] <= seen[1:], "at most the highest")
-    prior_cost = read_prior_cost(body["anchor"], size) if "anchor" in body else None
+    context, prior_cost = body["scene_gating"], body["prior_cost"]
+    if context is not None:
+        context = _array("scene_gating", context, (size, size))
+    seen = _array("training_range", body["training_range"], (2, size))
+    _every("training_range", seen[:1], seen[:1] <= seen[1:], "at most the highest")
     loss = _map("loss", body["loss"], ("name", "leaky_rate"))
     _text("loss.name", loss["name"])
     if loss["leaky_rate"] is not None:
@@ -364,7 +359,7 @@ def _fields(body: dict[str, Any]) -> dict[str, Any]:
         "leaky_slope": _number("leaky_slope", body["leaky_slope"]),
         "context": context,
         "seen": seen,
-        "prior_cost": prior_cost,
+        "prior_cost": None if prior_cost is None else _prior_cost(prior_cost, size),
         "loss": loss,
         "provenance": _plain("provenance", body["provenance"], MAX_DEPTH),
     }
@@ -398,23 +393,21 @@ def _layers(value: object, width: int) -> dict[str, tuple[np.ndarray, ...]]:
     return {"kernels": tuple(kernels), "biases": tuple(biases)}
 
 
-def read_prior_cost(value: object, features: int) -> PriorCost:
-    """The body's `anchor`, checked but for the gains of the samples.
-
-    Raises:
-      WeightsError: a field is wrong.
-    """
-    box = _map("anchor", value, PRIOR_COST_KEYS)
-    text = _text("anchor.incumbent", box["incumbent"])
-    low, high = (_number(f"anchor.{key}", box[key]) for key in PRIOR_COST_NUMBERS)
+def _prior_cost(value: object, features: int) -> PriorCost:
+    """The prior cost, checked but for the gains of the samples."""
+    box = _map("prior_cost", value, PRIOR_COST_KEYS)
+    text = _text("prior_cost.incumbent", box["incumbent"])
+    low, high = (_number(f"prior_cost.{key}", box[key]) for key in ("low", "high"))
     if low < 0.0:
-        _fail("anchor.low", low, "at least 0")
+        _fail("prior_cost.low", low, "at least 0")
     if high < low:
-        _fail("anchor.high", high, f"at least low, {_show(low)}")
-    read = lambda key, *shape: _array(f"anchor.{key}", box[key], shape)  # noqa: E731
+        _fail("prior_cost.high", high, f"at least low, {_show(low)}")
+    at = "prior_cost.familiarity"
+    box = _map(at, box["familiarity"], FAMILIARITY_KEYS)
+    read = lambda key, *shape: _array(f"{at}.{key}", box[key], shape)  # noqa: E731
     location, scale = read("location", features), read("scale", features)
-    _every("anchor.scale", scale, scale > 0.0, "over 0")
     kernel = read("kernel", features, range(1, MAX_UNITS + 1))
+    _every(f"{at}.scale", scale, scale > 0.0, "over 0")
     units = kernel.shape[1]
     return PriorCost(
         incumbent=text,
@@ -441,9 +434,9 @@ def _plain(field: str, value: Any, depth: int) -> Any:  # noqa: ANN401
     return value
 
 
-def _verify(reward: Reward, samples: object, prior_cost: Any) -> None:  # noqa: ANN401
+def _verify(reward: Reward, samples: object) -> None:
     """The file's own samples must score, and have gains, as the file says."""
-    found = _map("samples", samples, ("features", "valid", "value"))
+    found = _map("samples", samples, SAMPLE_KEYS)
     wanted = _array("samples.value", found["value"], (range(1, MAX_SAMPLES + 1),))
     shape = (len(wanted), len(reward.times), len(reward.names))
     features = _array("samples.features", found["features"], shape)
@@ -458,12 +451,15 @@ def _verify(reward: Reward, samples: object, prior_cost: Any) -> None:  # noqa: 
         if not abs(scored - want) <= TOLERANCE * max(1.0, abs(want)):
             need = f"{want:.9g} within {TOLERANCE:g} of max(1, |V|)"
             _fail(f"samples[{index}]", f"scored {scored:.9g}", need)
-    if reward.prior_cost is not None:
-        gains = _array("anchor.gain", prior_cost["gain"], (len(wanted),))
-        with np.errstate(all="ignore"):
-            error = np.abs(reward.prior_cost.gain(features[:, 0]).astype(float) - gains)
-        good = error <= TOLERANCE * np.maximum(1.0, np.abs(gains))
-        _every("anchor.gain", gains, good, "the gain of the sample")
+    if reward.prior_cost is None:
+        if found["gain"] is not None:
+            _fail("samples.gain", found["gain"], "none without a prior cost")
+        return
+    gains = _array("samples.gain", found["gain"], (len(wanted),))
+    with np.errstate(all="ignore"):
+        error = np.abs(reward.prior_cost.gain(features[:, 0]).astype(float) - gains)
+    good = error <= TOLERANCE * np.maximum(1.0, np.abs(gains))
+    _every("samples.gain", gains, good, "the gain of the sample")
 
 
 def _unpack(field: str, data: bytes) -> object:

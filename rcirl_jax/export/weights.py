@@ -49,7 +49,7 @@ class RewardWeights:
     """A reward in its effective weights: any scale pinning is already applied.
 
     x = (clip(f, lower, upper) - location) / scale, scaled by the scene's gains if
-    there is a context, then the layers, the last one linear with one output;
+    there is scene gating, then the layers, the last one linear with one output;
     V = sum_t gamma_t * time_valid_t * r_t, higher is better. Arrays are anything
     numpy can turn into float32.
     """
@@ -64,11 +64,10 @@ class RewardWeights:
     gamma: np.ndarray  # [T]
     kernels: tuple[np.ndarray, ...]  # [F, H1], ..., [H, 1]
     biases: tuple[np.ndarray, ...]  # [H1], ..., [1]; one for every kernel
-    context: np.ndarray | None = None  # [F, F], gains by scene; None: one reward
-    seen: np.ndarray | None = None  # [2, F], ends of the training's range, or unknown
-    prior_cost: reader.PriorCost | None = (
-        None  # of a reward driven on top of an incumbent
-    )
+    context: np.ndarray | None = None  # [F, F] scene gating; None: one reward
+    seen: np.ndarray  # [2, F], ends of the training's range
+    # of a reward driven on top of an incumbent
+    prior_cost: reader.PriorCost | None = None
     activation: str  # of the hidden layers: tanh, relu, leaky_relu, identity
     leaky_slope: float  # negative slope of the hidden leaky_relu
     loss: Mapping[str, Any]  # name; leaky_rate of the rank loss, or None
@@ -155,7 +154,7 @@ def _pack_checked(
         body = _dump(_body(weights, samples))
         outer = {
             "magic": reader.MAGIC,
-            "schema_version": _version(weights),
+            "schema_version": reader.SCHEMA_VERSION,
             "body": body,
             "sha256": hashlib.sha256(body).hexdigest(),
         }
@@ -169,42 +168,37 @@ def _pack_checked(
         raise InputError(str(error)) from error
 
 
-def _version(weights: RewardWeights) -> int:
-    """The least that has all fields: who reads an older one goes on reading."""
-    if weights.prior_cost is not None:
-        return 4
-    if weights.seen is not None:
-        return 3
-    return 1 if weights.context is None else 2
-
-
 def _dump(value: dict[str, Any]) -> bytes:
     return cast("bytes", msgpack.packb(value, use_bin_type=True))
 
 
 def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, Any]:
-    """The body map, in the order of `reader.BODY_KEYS`; then what there is besides."""
+    """Return the body map, in the order of `reader.BODY_KEYS`."""
     if len(weights.kernels) != len(weights.biases):
         found = f"{len(weights.biases)} biases"
         raise ValueError(f"biases: {found}: expected one for each kernel")
     for key in PROVENANCE_KEYS:
         if key not in weights.provenance:
             raise ValueError(f"provenance.{key}: missing: expected a value or None")
-    more = {
-        name: _array(name, value)
-        for name, value in (("seen", weights.seen), ("context", weights.context))
-        if value is not None
-    }
-    if weights.prior_cost is not None:
-        if weights.seen is None:
-            raise ValueError(
-                "seen: missing: expected ranges in a reward with a prior cost"
-            )
-        more["anchor"] = _prior_cost(
-            weights.prior_cost, len(weights.features), samples[0]
-        )
+
+    def maybe(field: str, value: Any) -> Any:  # noqa: ANN401
+        return None if value is None else _array(field, value)
+
     layers = zip(weights.kernels, weights.biases, strict=True)
-    names = ("features", "valid", "value")
+    prior, gains = weights.prior_cost, None
+    if prior is not None:
+        arrays = {
+            key: _array(f"prior_cost.familiarity.{key}", getattr(prior, key))
+            for key in reader.FAMILIARITY_KEYS
+        }
+        stored = {n: np.asarray(getattr(prior, n), np.float32) for n in arrays}
+        try:
+            first = np.asarray(samples[0], np.float32)[:, 0]
+            gains = dataclasses.replace(prior, **stored).gain(first)
+        except (IndexError, TypeError, ValueError):
+            gains = np.zeros(1)  # the reader names what does not fit
+        numbers = {"low": _plain(prior.low), "high": _plain(prior.high)}
+        prior = {"incumbent": prior.incumbent, **numbers, "familiarity": arrays}
     return {
         "preset": weights.preset,
         "features": [_plain(vars(spec)) for spec in weights.features],
@@ -212,6 +206,7 @@ def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, 
             key: _array(f"normaliser.{key}", getattr(weights, key))
             for key in reader.RANGES
         },
+        "training_range": _array("training_range", weights.seen),
         "times": _array("times", weights.times),
         "gamma": _array("gamma", weights.gamma),
         "layers": [
@@ -223,35 +218,15 @@ def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, 
         ],
         "activation": weights.activation,
         "leaky_slope": _plain(weights.leaky_slope),
+        "scene_gating": maybe("scene_gating", weights.context),
+        "prior_cost": prior,
         "loss": _plain(weights.loss),
         "provenance": _plain(weights.provenance),
         "samples": {
-            name: _array(f"samples.{name}", sample)
-            for name, sample in zip(names, samples, strict=True)
+            name: maybe(f"samples.{name}", sample)
+            for name, sample in zip(reader.SAMPLE_KEYS, (*samples, gains), strict=True)
         },
-        **more,
     }
-
-
-def _prior_cost(
-    prior_cost: reader.PriorCost, features: int, samples_x: np.ndarray
-) -> dict[str, Any]:
-    """The map `anchor`, with the gains of the samples as its reader has them."""
-    arrays = {key: getattr(prior_cost, key) for key in reader.PRIOR_COST_ARRAYS}
-    box = {
-        "incumbent": prior_cost.incumbent,
-        **{key: _plain(getattr(prior_cost, key)) for key in reader.PRIOR_COST_NUMBERS},
-        **{key: _array(f"anchor.{key}", item) for key, item in arrays.items()},
-        "gain": None,
-    }
-    read = reader.read_prior_cost(box, features)
-    x = np.asarray(samples_x)
-    # of another shape: the reader names the samples
-    fits = x.dtype.kind in "fiub" and x.ndim == 3 and x.shape[-1] == features
-    with np.errstate(over="ignore"):
-        first = x[:, 0].astype(np.float32) if fits and x.shape[1] else None
-    gains = np.zeros(1) if first is None else read.gain(first)
-    return {**box, "gain": _array("anchor.gain", gains)}
 
 
 def _array(field: str, value: np.ndarray) -> dict[str, Any]:

@@ -72,7 +72,7 @@ class ComparedRun:
     numbers: Mapping[str, Interval]  # by the names of `page.METRICS`, those measured
 
 
-class _Check(msgspec.Struct):
+class _CheckFile(msgspec.Struct):
     kind: str
     name: str
     difference: float
@@ -81,13 +81,13 @@ class _Check(msgspec.Struct):
     measured: bool = True
 
 
-class _Verdict(msgspec.Struct):
+class _VerdictFile(msgspec.Struct):
     """verdict.json, what is used of it."""
 
     sentence: str
     decision: str
     cases: int
-    checks: list[_Check]
+    checks: list[_CheckFile]
     config: dict = {}
 
 
@@ -126,7 +126,7 @@ def read_run(folder: Path) -> ComparedRun:
     path = folder / "verdict.json"
     if "gate" not in stages or not path.is_file():
         raise InputError(f"{folder}: no verdict in it: expected {RUN}")
-    verdict = checked(read_json(path, "a verdict"), _Verdict, path)
+    verdict = checked(read_json(path, "a verdict"), _VerdictFile, path)
     settings = _settings(stages, verdict)
     return ComparedRun(
         name=str(folder),
@@ -143,7 +143,7 @@ def read_run(folder: Path) -> ComparedRun:
     )
 
 
-def _settings(stages: Mapping[str, dict], verdict: _Verdict) -> dict[str, str]:
+def _settings(stages: Mapping[str, dict], verdict: _VerdictFile) -> dict[str, str]:
     """Return recipe, data, commit; then training, simulated demonstrations, gate.
 
     A flag that says what the training's settings say too is left out.
@@ -192,7 +192,7 @@ def _said(value: object) -> str:
     return "–" if value is None or value == "" else str(value)
 
 
-def _of_verdict(verdict: _Verdict) -> dict[str, Interval]:
+def _of_verdict(verdict: _VerdictFile) -> dict[str, Interval]:
     """Return progress against the incumbent, as the report's card has it."""
     for kind in ("gain", "no loss"):
         for one in verdict.checks:

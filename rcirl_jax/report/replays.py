@@ -45,7 +45,7 @@ PLAN_AHEAD_S = np.arange(1.0, 6.0)  # s ahead of the frame at which the plan is 
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Drive:
+class ReplayedDrive:
     """One row's drive of a case, [I] frames; JSON-ready."""
 
     row: str
@@ -89,13 +89,13 @@ class Replay:
     ego: tuple[float, float]  # m, length and width
     # slot -> (kind, length, width) of whoever is met
     bodies: dict[int, tuple[str, float, float]]
-    drives: tuple[Drive, ...]
+    drives: tuple[ReplayedDrive, ...]
 
 
 def make_replays(
     rows: Sequence[Row], cases: CaseSet, ids: Sequence[str], plan_every: int
 ) -> list[Replay]:
-    """Drive the named cases with every row, and with the recorded human if any.
+    """ReplayedDrive the named cases with every row, and with the recorded human if any.
 
     On a CPU the drives are those of the suite (`drive_with_logs`); elsewhere they
     differ in the last digit, and traffic is chaotic: then a replay's numbers are its
@@ -123,7 +123,7 @@ def make_replays(
         rows = [row for row in rows if not row.follow_log]
     elif not any(row.follow_log for row in rows):
         rows = [*rows, human_row()]
-    drives: list[list[Drive]] = [[] for _ in ids]
+    drives: list[list[ReplayedDrive]] = [[] for _ in ids]
     for row in tqdm.tqdm(rows, desc="drive cases to be played", unit="row"):
         config = rollout_config(row, cases.duration_s, plan_every)
         driven = (every, *drive_with_logs(row, every, config))
@@ -138,7 +138,7 @@ def make_replays(
 
 def thin(
     row: str, case: Case, metrics: CaseMetrics, record: Record, shot: Snapshot
-) -> Drive:
+) -> ReplayedDrive:
     """Thin one drive to frames; unbatched numpy leaves, record and snapshots [S]."""
     last = int(np.flatnonzero(record.valid)[-1])
     steps = np.arange(FRAME_STEPS - 1, last + FRAME_STEPS, FRAME_STEPS)
@@ -147,7 +147,7 @@ def thin(
     follows = row == RECORDED_HUMAN
     short = (last + 1) * STEP_S < float(case.steps) * STEP_S - 1e-6
     red = np.asarray(shot.line_red, bool) & (case.lines.kind != LineKind.NONE)
-    return Drive(
+    return ReplayedDrive(
         row=row,
         summary=_summary(metrics),
         events=events,
@@ -275,7 +275,7 @@ def _broken_words(found: CaseMetrics) -> str:
     return ", ".join(broken_bounds(found)) or "all bounds hold, no line run"
 
 
-def goes_as(drive: Drive, found: CaseMetrics) -> bool:
+def goes_as(drive: ReplayedDrive, found: CaseMetrics) -> bool:
     """Return whether a drive breaks the bounds that `found` breaks."""
     return drive.summary.endswith(f", {_broken_words(found)}")
 
@@ -287,7 +287,7 @@ def _summary(found: CaseMetrics) -> str:
     return f"{float(found.progress):.0f} m driven, {near}, {_broken_words(found)}"
 
 
-def _apart(drives: Sequence[Drive]) -> float | None:
+def _apart(drives: Sequence[ReplayedDrive]) -> float | None:
     """Return when the first two drives are `APART_M` or `APART_MPS` apart."""
     if len(drives) < 2:
         return None
@@ -301,7 +301,7 @@ def _apart(drives: Sequence[Drive]) -> float | None:
 
 
 def _replay(
-    name: str, cases: CaseSet, place: int, case: Case, drives: tuple[Drive, ...]
+    name: str, cases: CaseSet, place: int, case: Case, drives: tuple[ReplayedDrive, ...]
 ) -> Replay:
     """Return a case and its road up to where the drives have looked."""
     road = case.road

@@ -130,8 +130,8 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
         "frames": lambda: _drawn(
             lambda to: draw_frames(report.dataset, reward, sampler, to, NUM_FRAMES)
         ),
-        "training": lambda: (
-            _drawn(lambda to: draw_training(workdir, to)) if workdir else []
+        "training": lambda: _drawn(
+            lambda to: draw_training(workdir, to) if workdir else []
         ),
         "data": lambda: _data(report.dataset),
         "sweep": lambda: _sweep(report.sweep),

@@ -17,7 +17,7 @@ from tests.train.test_step import CONFIG
 F, T, K = 3, 4, 10
 
 
-def made(seen=True, **changes):
+def made(**changes):
     """A reward whose features lie in [-1, 1] with location 0 and scale 0.4."""
     weights = dataclasses.replace(
         example_weights(),
@@ -25,7 +25,7 @@ def made(seen=True, **changes):
         upper=np.full(F, 2.0),
         location=np.zeros(F),
         scale=np.full(F, 0.4),
-        seen=np.array([[-1.0] * F, [1.0] * F]) if seen else None,
+        seen=np.array([[-1.0] * F, [1.0] * F]),
         **changes,
     )
     return decode_weights(pack(weights, *example_samples(weights)))
@@ -36,17 +36,15 @@ def plan(seed=0, spread=1.0):
     return drawn.astype(np.float32)
 
 
-@pytest.mark.parametrize("seen", [True, False])
-def test_a_plan_as_in_training_is_the_rewards(seen):
-    reward, features = made(seen), plan()
+def test_a_plan_as_in_training_is_the_rewards():
+    reward, features = made(), plan()
     index, verdict = Guard(reward).choose(features, -reward.value(features))
     assert verdict.in_distribution
     assert index == np.argmax(reward.value(features))
 
 
-@pytest.mark.parametrize("seen", [True, False])
-def test_a_feature_far_out_is_named_and_the_incumbent_drives(seen):
-    reward, features = made(seen), plan()
+def test_a_feature_far_out_is_named_and_the_incumbent_drives():
+    reward, features = made(), plan()
     features[..., 1] += 3.0
     incumbent = np.arange(K, dtype=np.float64)
     incumbent[-1] = np.nan  # has no value, so never drives
@@ -65,21 +63,17 @@ def test_the_limits_are_limits():
     verdict = Guard(reward).check(features)
     assert (verdict.in_distribution, verdict.share) == (False, 11 / 40)
     assert Guard(reward, Limits(share=0.3)).check(features).in_distribution
-    far = np.full((K, T, F), 1.19, np.float32)
-    assert Guard(made(False)).check(far).in_distribution
-    assert not Guard(made(False), Limits(reach=2.9)).check(far).in_distribution
 
 
-def reaching(low, high, seen=True):
-    """A reward clipped to [-1, 1] whose training, or reach, got to [low, high]."""
-    middle, half = 0.5 * (np.array(low) + high), 0.5 * (np.array(high) - low)
+def reaching(low, high):
+    """A reward clipped to [-1, 1] whose training got to [low, high]."""
     weights = dataclasses.replace(
         example_weights(),
         lower=np.full(F, -1.0),
         upper=np.full(F, 1.0),
-        location=np.zeros(F) if seen else middle,
-        scale=np.ones(F) if seen else half / 3.0,
-        seen=np.array([low, high]) if seen else None,
+        location=np.zeros(F),
+        scale=np.ones(F),
+        seen=np.array([low, high]),
     )
     return decode_weights(pack(weights, *example_samples(weights)))
 
@@ -94,9 +88,8 @@ def test_beyond_a_range_that_training_did_not_fill_is_outside(value):
     assert verdict.share == 1.0
 
 
-@pytest.mark.parametrize("seen", [True, False])
-def test_a_side_is_open_where_training_reached_the_limit(seen):
-    judge = Guard(reaching([-1.0, -0.5, -1.5], [0.5, 1.0, 1.5], seen))
+def test_a_side_is_open_where_training_reached_the_limit():
+    judge = Guard(reaching([-1.0, -0.5, -1.5], [0.5, 1.0, 1.5]))
     np.testing.assert_array_equal(np.isneginf(judge.low), [True, False, True])
     np.testing.assert_array_equal(np.isposinf(judge.high), [False, True, True])
     assert judge.blind == ("feature2",)
@@ -115,7 +108,7 @@ def test_the_margin_opens_no_side():
     assert judge.blind == ()
     np.testing.assert_allclose(judge.high, 1000.999)
     # guards of files that cover little are blind to nothing
-    assert Guard(made()).blind == Guard(made(False)).blind == ()
+    assert Guard(made()).blind == ()
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -155,7 +148,6 @@ def test_a_file_as_training_exports_it_notices_what_it_never_saw(tmp_path):
     reward = export_run(tmp_path / "run", dataset, tmp_path / "w.msgpack")
     judge, usual = Guard(reward), reward.location[None, None]
     assert judge.check(usual).in_distribution
-    assert reward.seen is not None
     below, above = reward.seen[0] <= reward.lower, reward.seen[1] >= reward.upper
     assert 0 < below.sum() < below.size
     assert 0 < above.sum() < above.size

@@ -55,18 +55,6 @@ def test_it_has_the_columns_of_the_package():
     assert {name: unit for name, (unit, _) in features.COLUMNS.items()} == units
 
 
-def test_lists_and_float64_are_taken():
-    plain = scene(path=path(kappa=FLAT.tolist()), obstacles=(box(kind=1),))
-    found = columns()(plain, S.tolist(), np.zeros((1, 18)))
-    assert found.shape == (1, 18, 28)
-    assert found.dtype == np.float32
-    assert found[0, 0, columns().names.index("follow_distance")] == 18.0
-
-
-def test_no_candidates_have_no_features():
-    assert columns()(scene(), np.zeros((0, 18))).shape == (0, 18, 28)
-
-
 GAP = np.where(np.arange(18) == 3, np.nan, 1.0)
 
 

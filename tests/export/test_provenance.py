@@ -48,12 +48,6 @@ def test_features_that_no_package_has(tmp_path, preset):
         open_reward(str(path))
 
 
-def test_what_is_not_said_is_no_mistake(tmp_path, monkeypatch):
-    nothing = dict.fromkeys(("seed", "flags", "git_commit", "versions"))
-    path = with_provenance(tmp_path, monkeypatch, **nothing)
-    assert open_reward(str(path)).provenance["seed"] is None
-
-
 def run_on(folder, data):
     """A run's folder whose flags name these data."""
     config = dataclasses.asdict(TrainConfig())
@@ -68,11 +62,6 @@ def test_names_that_no_dataset_can_have(tmp_path, found):
         InputError, match=r"run\.json: flags\.data: .*expected a dataset"
     ):
         datasets_of(run_on(tmp_path, found))
-
-
-def test_one_dataset_or_several(tmp_path):
-    assert datasets_of(run_on(tmp_path, "a")) == ["a"]
-    assert datasets_of(run_on(tmp_path, ["a", "b"])) == ["a", "b"]
 
 
 def test_a_run_that_is_none_is_one_line(tmp_path):

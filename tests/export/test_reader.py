@@ -169,7 +169,7 @@ def test_wrong_arguments_are_one_line(features, time_valid, message):
 
 
 def test_the_total_is_the_incumbents_value_and_the_gained_one():
-    weights = example_weights(anchored=True)
+    weights = example_weights(with_prior=True)
     features, valid, values = example_samples(weights, count=6, seed=4)
     reward = decode_weights(WITH_PRIOR)
     gains = reward.gain(features)
@@ -184,14 +184,14 @@ def test_the_total_is_the_incumbents_value_and_the_gained_one():
     folded = reward.total(features.reshape(2, 3, 4, 3), own.reshape(2, 3))
     np.testing.assert_array_equal(folded.ravel(), reward.total(features, own))
     np.testing.assert_array_equal(reward.value(features, valid[0]).shape, (6,))
-    plain = decode_weights(packed(seen=True))
+    plain = decode_weights(packed())
     np.testing.assert_array_equal(reward.value(features), plain.value(features))
     assert reward.total(features[0], np.ones(())).shape == ()
 
 
 def test_a_gain_needs_the_features_that_matter_to_it():
     reward = decode_weights(WITH_PRIOR)
-    features, *_ = example_samples(example_weights(anchored=True), count=3)
+    features, *_ = example_samples(example_weights(with_prior=True), count=3)
     expected = reward.gain(features)
     features[:, 0, 0] = np.nan  # its row of the kernel is 0
     features[:, 1:] = np.nan
@@ -205,7 +205,7 @@ def test_a_gain_needs_the_features_that_matter_to_it():
         (
             decode_weights(VALID),
             features,
-            "anchor: missing: expected a reward with a prior",
+            "prior_cost: None: expected a reward with a prior",
         ),
     ):
         with pytest.raises(WeightsError, match=message):
@@ -215,7 +215,7 @@ def test_a_gain_needs_the_features_that_matter_to_it():
 @pytest.mark.parametrize(
     ("own", "late", "message"),
     [
-        (np.zeros(()), True, "time_valid: 0 at the first time: expected 1: gains"),
+        (np.zeros(()), True, "time_valid: 0 at the first time: expected 1: gates"),
         (np.zeros(2), False, r"incumbent: .*: expected numbers of shape \(3,\)"),
         (np.array(["a"] * 3), False, "incumbent: <U1: expected numbers"),
         (np.array([0.0, np.nan, 0.0]), False, r"total\[1\]: not finite: expected fin"),
@@ -223,7 +223,7 @@ def test_a_gain_needs_the_features_that_matter_to_it():
     ],
 )
 def test_what_has_no_total_is_one_line(own, late, message):
-    features, valid, _ = example_samples(example_weights(anchored=True), count=3)
+    features, valid, _ = example_samples(example_weights(with_prior=True), count=3)
     with pytest.raises(WeightsError, match=message):
         decode_weights(WITH_PRIOR).total(
             features, own, np.arange(4) > 0 if late else valid
@@ -265,7 +265,7 @@ def test_a_wrong_file_is_refused(data, message):
     ("data", "path", "place"),
     [
         (VALID, ["samples", "value", "data"], "samples[0]: scored"),
-        (WITH_PRIOR, ["anchor", "gain", "data"], "anchor.gain[0]: "),
+        (WITH_PRIOR, ["samples", "gain", "data"], "samples.gain[0]: "),
     ],
 )
 def test_samples_and_gains_are_met_to_one_part_in_a_hundred_thousand(data, path, place):
@@ -319,14 +319,6 @@ def test_random_flipped_and_cut_bytes_are_refused(data, bits, length):
         refusal(damaged)
 
 
-def test_every_single_bit_outside_the_body_is_guarded():
-    body = msgpack.unpackb(VALID)["body"]
-    start = VALID.index(body)
-    places = [*range(start), *range(start + len(body), len(VALID))]
-    for bit in (8 * place + offset for place in places for offset in range(8)):
-        refusal(flipped(VALID, {bit}))
-
-
 def only_weights_errors(data):
     try:
         reward = decode_weights(data)
@@ -363,7 +355,10 @@ def places(value, way=()):
 
 
 PLACES = [(VALID, way) for way in places(body_of())]
-PLACES += [(WITH_PRIOR, ("anchor", *x)) for x in places(body_of(WITH_PRIOR)["anchor"])]
+PLACES += [
+    (WITH_PRIOR, ("prior_cost", *way))
+    for way in places(body_of(WITH_PRIOR)["prior_cost"])
+]
 
 
 @settings(max_examples=2 * CASES)
@@ -386,7 +381,7 @@ def test_the_pure_python_msgpack_refuses_the_same(monkeypatch):
         refusal(data)
 
 
-def test_a_conditioned_reward_needs_the_first_time():
+def test_scene_gating_needs_the_first_time():
     weights = example_weights(by_context=True)
     features, valid, values = example_samples(weights)
     reward = decode_weights(pack(weights, features, valid, values))

@@ -221,21 +221,15 @@ LINES = {"ego": EGO, "body": LEAD, "road": ROAD}
     ("changes", "line"),
     [
         ({"ego": {"length": 0.0}}, "ego.length: 0.0: expected over 0 m"),
-        ({"ego": {"speed": -1.0}}, "ego.speed: -1.0: expected 0 m/s or more"),
         (
             {"ego": {"x": float("nan")}},
             "ego.x: nan: expected finite numbers up to 1e+09",
-        ),
-        (
-            {"ego": {"x": 2e9}},
-            "ego.x: 2000000000.0: expected finite numbers up to 1e+09",
         ),
         (
             {"road": {"points": [[0.0009 * i, 0.0] for i in range(2000)]}},
             "centre_line.points: 2000 points, 0 m long: expected a line of 1 m to "
             "100 km",
         ),
-        ({"ego": {"x": "here"}}, "ego.x: here: expected numbers"),
         ({"ego": {"heading": 90.0}}, "ego.heading: 90: expected radians, not degrees"),
         (
             {"ego": {"heading": 3.0}},
@@ -258,10 +252,6 @@ LINES = {"ego": EGO, "body": LEAD, "road": ROAD}
             "drives in 8 s",
         ),
         (
-            {"road": {"points": [[0.0, 0.0]]}},
-            "centre_line.points: 1 points, 0 m long: expected a line of 1 m to 100 km",
-        ),
-        (
             {"road": {"points": [0.0, 1.0]}},
             "centre_line.points: shape (2,): expected rows of 2 numbers",
         ),
@@ -271,15 +261,10 @@ LINES = {"ego": EGO, "body": LEAD, "road": ROAD}
             "points, or one for all",
         ),
         (
-            {"road": {"speed_limit": 0.0}},
-            "centre_line.speed_limit: [0.]: expected over 0 m/s",
-        ),
-        (
             {"body": {"kind": "vehicel"}},
             "obstacles[0].kind: vehicel: expected one of vehicle, cyclist, pedestrian, "
             "static; did you mean vehicle?",
         ),
-        ({"body": {"width": -1.0}}, "obstacles[0].width: -1.0: expected over 0 m"),
         (
             {"signals": [Signal(x=80.0, y=0.0, state="rot")]},
             "signals[0].state: rot: expected one of red, stop, yellow, green, off",

@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import struct
+from pathlib import Path
 from types import SimpleNamespace
 
 import jsonschema
@@ -25,6 +26,7 @@ from rcirl_jax.export import (
     to_json,
 )
 from rcirl_jax.runtime.specs import spec_root
+from tests.export.wrong import body_of
 from tests.helpers.weights_files import (
     ACTIVATIONS,
     example_prior_cost,
@@ -82,9 +84,10 @@ def assert_back(found, made, names):
 
 
 def test_everything_comes_back_as_it_was_given():
-    weights = example_weights(hidden=(4, 2), activation="leaky_relu", anchored=True)
+    weights = example_weights(hidden=(4, 2), activation="leaky_relu", with_prior=True)
     reward = decode_weights(pack(weights, *example_samples(weights)))
     numbers = ("lower", "upper", "location", "scale", "times", "gamma")
+    np.testing.assert_array_equal(reward.seen, np.float32(weights.seen))
     assert_back(reward, weights, (*numbers, "kernels", "biases"))
     assert reward.names == tuple(spec.name for spec in weights.features)
     assert reward.units == tuple(spec.unit for spec in weights.features)
@@ -96,10 +99,10 @@ def test_everything_comes_back_as_it_was_given():
     made, found = weights.prior_cost, reward.prior_cost
     assert made is not None
     assert found is not None
-    assert_back(found, made, reader.PRIOR_COST_ARRAYS)
+    assert_back(found, made, reader.FAMILIARITY_KEYS)
     for name in ("incumbent", "low", "high"):
         assert getattr(found, name) == getattr(made, name)
-    assert decode_weights(packed(seen=True)).prior_cost is None
+    assert decode_weights(packed()).prior_cost is None
 
 
 def test_same_input_same_bytes_whatever_the_order_of_keys(tmp_path):
@@ -132,18 +135,11 @@ def test_layout_is_the_documented_one():
     assert outer["sha256"] == hashlib.sha256(outer["body"]).hexdigest()
     body = msgpack.unpackb(outer["body"])
     assert tuple(body) == reader.BODY_KEYS
-    for version, kinds, more in (
-        (2, ("by_context",), ("context",)),
-        (3, ("seen",), ("seen",)),
-        (3, ("seen", "by_context"), ("seen", "context")),
-        (4, ("anchored",), ("seen", "anchor")),
-        (4, ("anchored", "by_context"), ("seen", "context", "anchor")),
-    ):
-        other = msgpack.unpackb(packed(**dict.fromkeys(kinds, True)))
-        assert other["schema_version"] == version
-        found = msgpack.unpackb(other["body"])
-        assert tuple(found) == (*reader.BODY_KEYS, *more)
-        assert version < 4 or tuple(found["anchor"]) == reader.PRIOR_COST_KEYS
+    assert body["scene_gating"] is body["prior_cost"] is body["samples"]["gain"] is None
+    full = body_of(packed(with_prior=True, by_context=True))
+    assert full["scene_gating"]["shape"] == [3, 3]
+    assert tuple(full["prior_cost"]) == reader.PRIOR_COST_KEYS
+    assert tuple(full["prior_cost"]["familiarity"]) == reader.FAMILIARITY_KEYS
     kernel = body["layers"][0]["kernel"]
     assert (kernel["shape"], kernel["dtype"]) == ([3, 5], "<f4")
     weights = example_weights()
@@ -172,9 +168,11 @@ def test_a_reader_written_from_the_page_scores_the_samples(by_context):
         biases=[numbers(layer["bias"]) for layer in body["layers"]],
         activation=body["activation"],
         leaky_slope=body["leaky_slope"],
-        context=numbers(body["context"]) if by_context else None,
+        context=numbers(body["scene_gating"]) if by_context else None,
     )
-    features, valid, values = (numbers(box) for box in body["samples"].values())
+    features, valid, values = (
+        numbers(body["samples"][key]) for key in reader.SAMPLE_KEYS[:3]
+    )
     scored = [loop_value(found, *one) for one in zip(features, valid, strict=True)]
     np.testing.assert_allclose(scored, values, rtol=1e-5, atol=1e-5)
 
@@ -184,36 +182,64 @@ def test_schema_describes_the_body_and_refuses_others():
     schema = json.loads(path.read_text(encoding="utf-8"))
     jsonschema.Draft202012Validator.check_schema(schema)
     validator = jsonschema.Draft202012Validator(schema)
-    kinds = ({"hidden": (4, 2)}, {"by_context": True}, {"seen": True})
-    body, gated, ranged = (to_json(packed(**kind)) for kind in kinds)
-    anchored = to_json(packed(anchored=True))
-    for made in (body, gated, ranged, anchored):
+    kinds = ({"hidden": (4, 2)}, {"by_context": True, "with_prior": True})
+    plain, full = (to_json(packed(**kind)) for kind in kinds)
+    for made in (plain, full, to_json(GOLDEN.read_bytes())):
         validator.validate(made)
         json.dumps(made, allow_nan=False)
-    gamma = np.frombuffer(base64.b64decode(body["gamma"]["data"]), "<f4")
+    gamma = np.frombuffer(base64.b64decode(plain["gamma"]["data"]), "<f4")
     np.testing.assert_array_equal(gamma, example_weights(hidden=(4, 2)).gamma)
-    found, prior_cost = schema["properties"], schema["properties"]["anchor"]
-    assert set(schema["required"]) == set(reader.BODY_KEYS)
-    assert set(found) == {*reader.BODY_KEYS, "context", "seen", "anchor"}
-    assert set(prior_cost["required"]) == set(prior_cost["properties"])
-    assert set(prior_cost["required"]) == set(reader.PRIOR_COST_KEYS)
+    found = schema["properties"]
+    prior = found["prior_cost"]["anyOf"][1]
+    for described, keys in (
+        (schema, reader.BODY_KEYS),
+        (found["samples"], reader.SAMPLE_KEYS),
+        (prior, reader.PRIOR_COST_KEYS),
+        (prior["properties"]["familiarity"], reader.FAMILIARITY_KEYS),
+    ):
+        assert tuple(described["required"]) == tuple(described["properties"]) == keys
     assert found["activation"]["enum"] == sorted(ACTIVATIONS)
 
     def less(made, key):
         return {k: v for k, v in made.items() if k != key}
 
-    wrong = [
-        {**gated, "context": 1}, {**ranged, "seen": ranged["gamma"]},
-        less(anchored, "seen"), {**body, "extra": 1},
-        {**body, "gamma": {**body["gamma"], "dtype": "<f8"}},
-    ]  # fmt: skip
+    wrong = [{**plain, "extra": 1}, {**full, "scene_gating": full["gamma"]}]
+    wrong.append({**plain, "gamma": {**plain["gamma"], "dtype": "<f8"}})
     for key in reader.BODY_KEYS:
-        wrong += [less(body, key), {**body, key: True}]
+        wrong += [less(full, key), {**full, key: True}]
+    box = full["prior_cost"]
     for key in reader.PRIOR_COST_KEYS:
-        box = anchored["anchor"]
         others = (less(box, key), {**box, key: True}, {**box, "extra": 1})
-        wrong += [{**anchored, "anchor": other} for other in others]
+        wrong += [{**full, "prior_cost": other} for other in others]
     assert not any(map(validator.is_valid, wrong))
+
+
+# -------------------------------------------------------------- a file that is kept
+
+GOLDEN = Path(__file__).parent / "golden" / "weights.msgpack"
+
+
+def golden():
+    """The file, inputs, masks, and what it scored and added when it was written."""
+    told = json.loads(GOLDEN.with_suffix(".json").read_text())
+    names = ("features", "time_valid", "value", "gain", "incumbent", "total")
+    return GOLDEN, *(np.array(told[name]) for name in names)
+
+
+def test_a_file_that_planners_have_scores_as_it_did():
+    """Never made anew: a reader that fails here would strand the weights in use."""
+    path, features, valid, value, gain, own, total = golden()
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == (
+        "724ac3da0a02aadcbdeac52afc10534b4cd81f267214f1ef83ba8e4c77b702f9"
+    )
+    reward = load_weights(path)
+    assert reward.names == ("feature0", "feature1", "feature2", "feature3")
+    assert reward.context is not None
+    close = {"rtol": 1e-6, "atol": 1e-6}
+    assert np.ptp(value) > 1.0
+    np.testing.assert_allclose(reward.value(features, valid), value, **close)
+    np.testing.assert_allclose(reward.gain(features), gain, **close)
+    np.testing.assert_allclose(reward.total(features, own, valid), total, **close)
 
 
 ENDLESS: dict = {}
@@ -259,15 +285,15 @@ def test_what_a_reader_would_refuse_is_never_written(changes, message, tmp_path)
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"high": 0.1}, "anchor.high: 0.1: expected at least low, 0.25"),
-        ({"high": [1.0]}, "anchor.high: list of 1: expected a finite number"),
-        ({"bias": "many"}, "anchor.bias: could not convert string to float"),
-        ({"out": np.ones(3)}, "anchor.out.shape: [3]: expected [4]"),
-        ({"high": 1e300}, "anchor.gain[0]: inf: expected finite numbers"),
+        ({"high": 0.1}, "prior_cost.high: 0.1: expected at least low, 0.25"),
+        ({"high": [1.0]}, "prior_cost.high: list of 1: expected a finite number"),
+        ({"bias": "many"}, "prior_cost.familiarity.bias: could not convert string"),
+        ({"out": np.ones(3)}, "prior_cost.familiarity.out.shape: [3]: expected [4]"),
+        ({"high": 1e300}, "samples.gain[0]: inf: expected finite numbers"),
     ],
 )
-def test_an_anchor_that_a_reader_would_refuse_is_never_written(changes, message):
-    weights = example_weights(anchored=True)
+def test_a_prior_cost_that_a_reader_would_refuse_is_never_written(changes, message):
+    weights = example_weights(with_prior=True)
     prior_cost = dataclasses.replace(example_prior_cost(), **changes)
     with pytest.raises(InputError) as caught:
         pack(
@@ -277,11 +303,9 @@ def test_an_anchor_that_a_reader_would_refuse_is_never_written(changes, message)
     assert f"weights: {message}" in str(caught.value)
 
 
-def test_an_anchor_needs_ranges_and_samples_that_fit():
-    weights = example_weights(anchored=True)
+def test_a_prior_cost_needs_samples_that_fit():
+    weights = example_weights(with_prior=True)
     features, valid, values = example_samples(weights)
-    with pytest.raises(InputError, match=r"seen: missing: expected ranges in an anch"):
-        pack(dataclasses.replace(weights, seen=None), features, valid, values)
     for wrong in (features[:, :, :2], features[:0], features[:, :0], features[0]):
         with pytest.raises(InputError, match=r"samples\.features\.shape: .*: expected"):
             pack(weights, wrong, valid, values)

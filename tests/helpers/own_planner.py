@@ -43,6 +43,7 @@ def drawn_reward(path, columns, hidden=(15,), by_context=False, seed=3):
         ),
         lower=lower,
         upper=upper,
+        seen=np.stack([lower, upper]),
         location=np.array([spec.none for spec in specs]),
         scale=0.3 * (upper - lower),
         times=TIMES_S,

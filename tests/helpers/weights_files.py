@@ -33,7 +33,7 @@ def provenance():
 
 def example_weights(
     seed=0, features=3, times=4, hidden=(5,), activation="tanh", by_context=False,
-    seen=False, anchored=False,
+    with_prior=False,
 ):  # fmt: skip
     rng = np.random.default_rng(seed)
     sizes = (features, *hidden, 1)
@@ -51,8 +51,8 @@ def example_weights(
         times=np.linspace(0.0, 8.0, times, dtype=np.float32),
         gamma=draw(times),
         context=draw(features, features) if by_context else None,
-        seen=np.sort(draw(2, features), axis=0) if seen or anchored else None,
-        prior_cost=example_prior_cost(seed, features) if anchored else None,
+        seen=np.sort(np.random.default_rng(seed).normal(size=(2, features)), axis=0),
+        prior_cost=example_prior_cost(seed, features) if with_prior else None,
         kernels=tuple(draw(*pair) for pair in pairwise(sizes)),
         biases=tuple(draw(size) for size in sizes[1:]),
         activation=activation,
@@ -149,6 +149,7 @@ def of_the_preset(made, **changes):
     )
     own = {"preset": "paper21", "times": TIMES_S, "leaky_slope": LEAKY_SLOPE}
     own |= {"lower": LOWER, "upper": UPPER, "features": features}
+    own["seen"] = np.stack([LOWER, UPPER])
     return dataclasses.replace(made, **{**own, **changes})
 
 

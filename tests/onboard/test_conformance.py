@@ -95,12 +95,6 @@ def checked(*command):
     return done.returncode, done.stdout.strip(), done.stderr.strip().splitlines()
 
 
-def test_equal_answers_pass(cases, tmp_path):
-    command = answers(cases, tmp_path, lambda _, numbers: numbers)
-    count = len(cases)
-    assert checked(*command) == (0, f"conformance: {count} of {count} cases equal", [])
-
-
 def test_features_alone_can_be_checked(cases, tmp_path):
     def without_scores(name, numbers):
         return numbers[: -len(cases[name].scores)]
@@ -110,22 +104,6 @@ def test_features_alone_can_be_checked(cases, tmp_path):
     status, _, lines = checked(*command)
     assert status == 1
     assert lines[0].startswith("free_road: 1134 numbers: expected 1137")
-
-
-def test_one_wrong_number_is_named(cases, tmp_path):
-    def change(name, numbers):
-        place = 21 + cases[name].columns.index("follow_distance")  # time 1
-        return [
-            x + 1e-3 * (name == "follow" and i == place) for i, x in enumerate(numbers)
-        ]
-
-    status, said, lines = checked(*answers(cases, tmp_path, change))
-    assert (status, said) == (
-        1,
-        f"conformance: {len(cases) - 1} of {len(cases)} cases equal",
-    )
-    (line,) = lines
-    assert line.startswith("follow: features: candidate 0, time 1, follow_distance: ")
 
 
 # what stands in the numpy file, the mistake instead, and the columns of the case

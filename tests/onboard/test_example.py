@@ -14,7 +14,7 @@ from rcirl_jax import Body, Car, CentreLine, load_weights, scene_from
 from rcirl_jax.export import reader
 from rcirl_jax.export.own_planner import features
 from rcirl_jax.export.own_planner.plain import plain_scene
-from tests.export.test_old_files import golden
+from tests.export.test_weights import golden
 from tests.helpers.own_planner import TOLERANCE, error, numpy_answers
 from tests.onboard.programs import ONBOARD, built, run
 
@@ -96,9 +96,9 @@ def test_the_twin_names_what_is_wrong(twin):
     assert done.stderr.startswith("none: ")
 
 
-def test_choose_adds_an_anchored_reward_to_the_costs(tmp_path):
+def test_choose_adds_a_reward_with_a_prior_cost_to_the_costs(tmp_path):
     choose = built(tmp_path / "build", "choose") / "choose"
-    weights, features, _, _ = golden(4)
+    weights, features, *_ = golden()
     features = features.astype("<f4")
     costs = np.linspace(2.0, -3.0, len(features), dtype="<f4")
     (tmp_path / "costs.f32").write_bytes(costs.tobytes())
@@ -116,7 +116,7 @@ def test_choose_adds_an_anchored_reward_to_the_costs(tmp_path):
     assert done.stdout.decode().startswith(start), done.stderr
     value = float(done.stdout.decode().removeprefix(start).split(",")[0])
     assert value == pytest.approx(total.max(), rel=1e-5)
-    alone = golden(3)[0]
+    alone = WEIGHTS[0]
     for arguments, wanted in (
         ((weights,), "COSTS as a second argument"),
         ((weights, tmp_path / "few.f32"), f"expected {len(costs)}"),

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.export import Guard, WeightsError, decode_weights, load_weights, save
-from tests.export import test_old_files, wrong
+from tests.export import test_weights, wrong
 from tests.export.test_reader import refusal
 from tests.helpers.weights_files import (
     example_samples,
@@ -27,9 +27,7 @@ from tests.onboard.programs import ONBOARD, built, configured, run
 
 VALID = packed(features=2, times=3, hidden=(4,))
 GATED = packed(features=2, times=3, hidden=(4,), by_context=True)
-RANGED = packed(features=2, times=3, hidden=(4,), seen=True)
-BOTH = packed(features=2, times=3, hidden=(4,), by_context=True, seen=True)
-WITH_PRIOR = packed(features=2, times=3, hidden=(4,), by_context=True, anchored=True)
+WITH_PRIOR = packed(features=2, times=3, hidden=(4,), by_context=True, with_prior=True)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +98,7 @@ def test_ten_thousand_scores_equal_python_and_jax(
 
 def test_ten_thousand_totals_equal_python(programs, tmp_path):
     path, rng = tmp_path / "weights.msgpack", np.random.default_rng(6)
-    weights = example_weights(features=21, times=4, hidden=(15,), anchored=True)
+    weights = example_weights(features=21, times=4, hidden=(15,), with_prior=True)
     reward = save(path, weights, *example_samples(weights))
     features = rng.normal(scale=2.0, size=(10_000, 4, 21)).astype(np.float32)
     features[:9999].reshape(-1, 3, 4, 21)[:, 1, 0] = features[:9999:3, 0]  # alike
@@ -113,14 +111,14 @@ def test_ten_thousand_totals_equal_python(programs, tmp_path):
         assert_close(found, reward.total(features, own, *mask))
 
 
-@pytest.mark.parametrize("version", [1, 2, 3, 4])
-def test_an_old_file_scores_as_it_did(programs, tmp_path, version):
-    golden, features, valid, expected = test_old_files.golden(version)
-    path = shutil.copy(golden, tmp_path / "weights.msgpack")
-    assert_close(scores(programs, "score", path, features, valid == 1), expected)
+def test_a_file_that_planners_have_scores_as_it_did(programs, tmp_path):
+    kept, features, valid, value, _, own, total = test_weights.golden()
+    path = shutil.copy(kept, tmp_path / "weights.msgpack")
+    assert_close(scores(programs, "score", path, features, valid == 1), value)
+    assert_close(scores(programs, "total", path, features, own, valid == 1), total)
 
 
-@pytest.mark.parametrize("data", [VALID, GATED, RANGED, BOTH, WITH_PRIOR])
+@pytest.mark.parametrize("data", [VALID, GATED, WITH_PRIOR])
 def test_a_thousand_plans_get_the_guard_of_python(programs, tmp_path, data):
     """Four candidates, some beyond, at an open side, or not finite."""
     path, rng = tmp_path / "weights.msgpack", np.random.default_rng(4)
@@ -159,8 +157,8 @@ def test_a_thousand_plans_get_the_guard_of_python(programs, tmp_path, data):
 def test_choose_takes_the_best_candidate_that_has_a_value(programs, tmp_path):
     path, missing = tmp_path / "weights.msgpack", tmp_path / "missing"
     path.write_bytes(VALID)
-    anchored = tmp_path / "anchored"
-    anchored.write_bytes(WITH_PRIOR)
+    with_prior = tmp_path / "with_prior"
+    with_prior.write_bytes(WITH_PRIOR)
     reward = load_weights(path)
     features = np.random.default_rng(0).normal(size=(50, 3, 2)).astype(np.float32)
     order = np.argsort(reward.value(features))
@@ -177,7 +175,12 @@ def test_choose_takes_the_best_candidate_that_has_a_value(programs, tmp_path):
         (path, features[:1].tobytes()[4:], "stdin: candidates: 5 numbers: expected", 2),
         (path, np.full(6, np.nan, "f4").tobytes(), "stdin: candidates: all 1 ref", 1),
         # a reward that is added to the cost of a planner, whose costs are missing
-        (anchored, b"", f"{anchored}: anchor: hand-set: expected COSTS as a second", 2),
+        (
+            with_prior,
+            b"",
+            f"{with_prior}: prior_cost: hand-set: expected COSTS as a second",
+            2,
+        ),
         (missing, b"", f"{python.value}\n", 2),
     ):
         done = subprocess.run(
@@ -199,7 +202,7 @@ def test_damaged_files_are_refused_with_one_line(programs, tmp_path):
         assert line.startswith("w: ")
         assert ": expected " in line
         assert line.isprintable()
-    good = [VALID, GATED, RANGED, BOTH, WITH_PRIOR]
+    good = [VALID, GATED, WITH_PRIOR]
     assert verdicts(programs, good, tmp_path) == ["ok"] * len(good)
 
 
@@ -219,10 +222,9 @@ def test_bodies_changed_and_hashed_again_get_the_verdict_of_the_python_reader(
     programs, tmp_path
 ):
     rng, files = np.random.default_rng(2), []
-    versions = ((1, VALID), (2, GATED), (3, RANGED), (3, BOTH), (4, WITH_PRIOR))
-    for version, data in versions:
+    for data in (VALID, GATED, WITH_PRIOR):
         body = msgpack.unpackb(data)["body"]
-        for _ in range(800):
+        for _ in range(1300):
             changed = bytearray(body)
             for _ in range(rng.integers(1, 4)):
                 at = int(rng.integers(0, len(changed)))
@@ -235,7 +237,7 @@ def test_bodies_changed_and_hashed_again_get_the_verdict_of_the_python_reader(
                         del changed[at]
                     case _:
                         changed.insert(at, int(rng.integers(0, 256)))
-            files.append(wrong.sealed(bytes(changed), schema_version=version))
+            files.append(wrong.sealed(bytes(changed)))
     expected = [is_valid(data) for data in files]
     assert 100 < sum(expected) < len(files) - 1000
     found = [line == "ok" for line in verdicts(programs, files, tmp_path)]

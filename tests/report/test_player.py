@@ -120,14 +120,3 @@ def test_the_recorded_human_drives_beside_the_others():
     at = FRAME_STEPS * (np.arange(len(human.s)) + 1)
     assert human.s == pytest.approx(log[np.minimum(at, len(log) - 1)], abs=0.06)
     assert not any(human.plan)
-
-
-def test_a_case_says_when_its_drives_part(replays):
-    one, two = replays[0].drives[:2]
-    when = replays[0].apart
-    at = one.t.index(when)
-    gap = np.abs(np.subtract(one.s[: at + 1], two.s[: at + 1]))
-    speeds = np.abs(np.subtract(one.v[: at + 1], two.v[: at + 1]))
-    assert gap[-1] > 2.0 or speeds[-1] > 1.0
-    assert (gap[:-1] <= 2.0).all()
-    assert (speeds[:-1] <= 1.0).all()

@@ -137,17 +137,6 @@ def test_the_ego_goes_along_the_line_and_its_offset_fades():
     episode.close()
 
 
-def test_an_ego_that_nobody_drives_stays():
-    episode = replay()
-    episode.step(MOVE)
-    before = episode.look()
-    episode.step(None)
-    view = episode.look()
-    assert (view.ego, view.way) == (before.ego, before.way)
-    assert view.obstacles[0].x == 32.0
-    episode.close()
-
-
 def test_an_own_driver_is_shown_where_the_worker_has_it():
     episode = replay(driven=True)
     episode.step(None)

@@ -136,14 +136,6 @@ def test_a_table_has_a_row_per_driver_and_paired_differences(driven):
         assert name in text_of(body)
 
 
-def test_an_episode_that_somebody_cannot_begin_is_left_out(driven):
-    results = {name: numbers_of(logs) for name, logs in driven.items()}
-    results["brakes"] = numbers_of({**driven["brakes"], STANDS: {}})
-    assert STANDS not in results["brakes"]
-    assert numbers_of({STANDS: {}}) == {}
-    assert table_of("straight", results, ["hand-set"])["episodes"] == 3
-
-
 def test_an_unknown_simulator_is_one_line():
     with pytest.raises(InputError, match=r"simulator: sumoo: .*did you mean sumo\?"):
         open_simulator("sumoo")

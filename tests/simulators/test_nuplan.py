@@ -99,13 +99,6 @@ def car(x, speed):
     return theirs.tracked("VEHICLE", *place(x, 0.0), speed)
 
 
-def test_it_has_the_shape_of_an_abstract_planner(planner):
-    assert isinstance(planner, theirs.AbstractPlanner)
-    assert planner.requires_scenario is False
-    assert planner.observation_type() is theirs.DetectionsTracks
-    assert isinstance(planner.name(), str)
-
-
 def test_a_plan_lasts_for_8_s_and_moves_as_it_says(planner):
     t, x, _, _, v = planned(planner, ego()).T
     np.testing.assert_allclose(t, 0.1 * np.arange(81), atol=1e-6)
@@ -130,11 +123,6 @@ def test_it_stops_behind_who_stands_and_before_a_red_light(planner):
     lights = [light(99, "RED"), light(20, "RED")]
     x = planned(planner, ego(x=40.0), lights=lights)[:, 1]
     assert 80.0 < x[-1] + 2.6 <= 100.0
-
-
-def test_a_green_light_stops_nobody(planner):
-    lights = [light(20, "GREEN"), light(31, "UNKNOWN")]
-    assert planned(planner, ego(x=60.0), lights=lights)[-1, 1] > 130.0
 
 
 def test_a_route_without_lanes_is_refused(planner):

@@ -124,9 +124,8 @@ def suggestions(folder: Path) -> Target:
 
 
 def weights(folder: Path) -> Target:
-    """Weights files of all four versions."""
-    both = {"by_context": True, "seen": True}
-    kinds = ({}, {"by_context": True}, both, {"by_context": True, "anchored": True})
+    """Weights files with and without scene gating and a prior cost."""
+    kinds = ({}, {"by_context": True}, {"by_context": True, "with_prior": True})
     files = [folder / f"{number}.msgpack" for number in range(len(kinds))]
     for file, kind in zip(files, kinds, strict=True):
         file.write_bytes(packed(hidden=(2,), features=2, times=2, **kind))

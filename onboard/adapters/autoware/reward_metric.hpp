@@ -6,7 +6,7 @@
 //   1 / (1 + exp((V0 - V) / maximum))      between 0 and 1, higher is better
 //
 // where `maximum` is the ranker's parameter of that name for this metric. A reward with an
-// anchor adds its gained V to the ranker's other metrics. Traffic lights are not among
+// prior cost adds its gained V to the ranker's other metrics. Traffic lights are not among
 // what a metric of the ranker is given. Tested against a stand-in of the ranker's
 // interface (tests/autoware), not in Autoware.
 #ifndef RCIRL_ADAPTERS_AUTOWARE_REWARD_METRIC_HPP_
@@ -101,7 +101,7 @@ class RewardMetric : public ranker::metrics::MetricInterface {
     columns_.compute(scene, {s.data(), l.data(), 2}, features.data());
     const rcirl::Mask mask = columns_.mask(scene);
     const bool refused =
-        reward_.anchored() ? reward_.total(features.data(), 2, mask, values, &workspace, values)
+        reward_.has_prior_cost() ? reward_.total(features.data(), 2, mask, values, &workspace, values)
                            : reward_.score(features.data(), 2, mask, &workspace, values);
     return refused ? 0.0f : 1.0f / (1.0f + std::exp((values[1] - values[0]) / scale));
   }

@@ -21,7 +21,6 @@ namespace rcirl {
 // How far a plan may depart.
 struct GuardLimits {
   double margin = 0.25;  // scales by which a recorded range is widened on each side
-  double reach = 3.0;    // scales around the location, for files without recorded ranges
   double share = 0.25;   // largest share of a feature's entries that may lie outside
 };
 
@@ -43,14 +42,8 @@ class Guard {
     const std::vector<float>& seen = reward.weights_.seen;
     for (std::size_t f = 0; f < features_; ++f) {
       const double scale = static_cast<double>(network.scale[f]);
-      const double location = static_cast<double>(network.location[f]);
-      double first = location - limits.reach * scale, last = location + limits.reach * scale;
-      double margin = 0.0;
-      if (!seen.empty()) {
-        first = static_cast<double>(seen[f]);
-        last = static_cast<double>(seen[f + features_]);
-        margin = limits.margin * scale;
-      }
+      const double first = static_cast<double>(seen[f]), margin = limits.margin * scale;
+      const double last = static_cast<double>(seen[f + features_]);
       // a value at its cap may lie anywhere beyond; what never varied has no cap
       const bool capped = network.lower[f] < network.upper[f];
       const bool open_below = capped && detail::narrow(first) <= network.lower[f];

@@ -8,8 +8,8 @@
 //   reward.score(features, count, {}, &workspace, values);     // [K, T, F] -> [K]
 //   std::size_t best = rcirl::best(values, count);             // count: none is usable
 //
-// An anchored reward (schema version 4) goes on top of the planner's own values: where
-// `reward.anchored()`, call `reward.total(..., own, &workspace, values)` instead of `score`.
+// A reward with a prior cost goes on top of the planner's own values: where
+// `reward.has_prior_cost()`, call `reward.total(..., own, &workspace, values)`, not `score`.
 //
 // Headers only, on top of msgpack-c's C headers; compiles with -fno-exceptions and
 // -fno-rtti. Loading allocates. Scoring allocates nothing, throws nothing, takes no lock,
@@ -61,7 +61,6 @@ class Workspace {
 // A verified reward. Empty (no features, scores nothing) until it is loaded.
 class Reward {
  public:
-  int version() const { return weights_.version; }                   // of the schema
   const std::string& file() const { return file_; }                  // as it was named
   const std::string& sha256() const { return weights_.sha256; }      // names the reward
   const std::string& preset() const { return weights_.preset; }      // of the features
@@ -84,25 +83,25 @@ class Reward {
   //   values     [K], written
   //
   // Returns how many candidates were refused. Their value is -infinity: a NaN at a valid
-  // time, a mask that is not 0 and 1, a sum beyond float32, or, with a reward by context
-  // (with a context), a first time that is not valid. Infinite features are clipped; at times
+  // time, a mask that is not 0 and 1, a sum beyond float32, or, with scene gating, a first
+  // time that is not valid. Infinite features are clipped; at times
   // that are not valid, features may be anything. Without a reward, or with a workspace
   // of another one that is too small, all are refused.
   std::size_t score(const float* features, std::size_t count, Mask valid,
                     Workspace* workspace, float* values) const noexcept;
 
   // Whether V is made to be added to the value of an incumbent, and of which one.
-  bool anchored() const { return !incumbent().empty(); }
-  const std::string& incumbent() const { return weights_.anchor.incumbent; }
+  bool has_prior_cost() const { return !incumbent().empty(); }
+  const std::string& incumbent() const { return weights_.prior_cost.incumbent; }
 
-  // V_incumbent + gain V of trajectories, of an anchored reward; higher is better.
+  // V_incumbent + gain V of trajectories, with a prior cost; higher is better.
   //
   //   incumbent  [K] its values (a cost, negated); may be the same memory as `values`
   //
   // The rest as `score`, which refuses the same candidates. Refused are also those with
   // a first time that is not valid, without a finite gain (a NaN at the first time among
   // the features that matter to it) or a finite value of the incumbent, and all
-  // candidates of a reward without an anchor.
+  // candidates of a reward without a prior cost.
   std::size_t total(const float* features, std::size_t count, Mask valid,
                     const float* incumbent, Workspace* workspace,
                     float* values) const noexcept;
@@ -115,8 +114,8 @@ class Reward {
   detail::Weights weights_;
 };
 
-// Reads and verifies the bytes of a file, schema version 1, 2, 3 or 4; `file` is their
-// name in messages. A failure leaves `reward` as it was.
+// Reads and verifies the bytes of a file; `file` is their name in
+// messages. A failure leaves `reward` as it was.
 inline Status decode(std::string_view data, const std::string& file, Reward* reward) {
   Reward read;
   const std::string error = detail::decode(data, &read.weights_);
@@ -196,7 +195,7 @@ inline std::size_t Reward::total(const float* features, std::size_t count, Mask 
                                  const float* incumbent, Workspace* workspace,
                                  float* values) const noexcept {
   constexpr float kNone = -std::numeric_limits<float>::infinity();
-  if (!anchored()) {
+  if (!has_prior_cost()) {
     std::fill(values, values + count, kNone);
     return count;
   }
@@ -216,14 +215,14 @@ inline std::size_t Reward::total(const float* features, std::size_t count, Mask 
       const float* x = block + k * row;
       // candidates of one scene begin alike
       const bool same = k > 0 && std::memcmp(x, x - row, network.features * sizeof *x) == 0;
-      if (!same) gain = detail::gain(weights_.anchor, x);
+      if (!same) gain = detail::gain(weights_.prior_cost, x);
       float& value = values[first + k];
       const double sum = static_cast<double>(own[k]) +
                          static_cast<double>(gain) * static_cast<double>(value);
       const bool starts = marks.data == nullptr || marks.data[k * stride] == 1;
-      const bool finite = std::abs(sum) <= std::numeric_limits<float>::max();
+      const bool finite = std::abs(sum) <= double{std::numeric_limits<float>::max()};
       value = starts && finite ? static_cast<float>(sum) : kNone;
-      refused += value == kNone;
+      refused += std::isinf(value);
     }
   }
   return refused;

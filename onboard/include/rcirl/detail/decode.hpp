@@ -5,15 +5,16 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
+#include <functional>
 #include <string>
 #include <string_view>
 #include <utility>
 #include <vector>
 
-#include "rcirl/detail/anchor.hpp"
 #include "rcirl/detail/checks.hpp"
 #include "rcirl/detail/limits.hpp"
 #include "rcirl/detail/network.hpp"
+#include "rcirl/detail/prior_cost.hpp"
 #include "rcirl/detail/sha256.hpp"
 #include "rcirl/detail/tree.hpp"
 
@@ -29,13 +30,12 @@ struct Feature {
 namespace detail {
 
 struct Weights {
-  int version = 0;
   std::string sha256;  // of the body; names this reward
   std::string preset;
   std::vector<Feature> features;  // [F]
   std::vector<float> times;       // [T] s
-  std::vector<float> seen;        // [2, F] ends of the training's range, or empty
-  Anchor anchor;                  // version 4, or empty
+  std::vector<float> seen;        // [2, F] ends of the training's range
+  PriorCost prior_cost;           // or empty
   Network network;
 };
 
@@ -92,7 +92,7 @@ inline bool decode_times(Checks& is, const Node& node, std::vector<float>* times
   Array array;
   if (!is.array("times", node, {{1, kMaxTimes}}, &array)) return false;
   *times = std::move(array.values);
-  if ((*times)[0] != 0.0f) {
+  if (std::abs((*times)[0]) > 0.0f) {
     return is.fail("times[0]", number_text(static_cast<double>((*times)[0])), "0 s first");
   }
   for (std::size_t i = 1; i < times->size(); ++i) {
@@ -150,38 +150,27 @@ inline bool decode_loss(Checks& is, const Node& node) {
          (loss[1]->kind == Kind::kNil || is.number("loss.leaky_rate", *loss[1], &rate));
 }
 
-// The samples' gains must be as the file says. `features` [m, T, F].
-inline bool verify_gains(Checks& is, const Node& node, const Anchor& anchor,
-                         const Array& features) {
-  const std::size_t count = features.shape[0], row = features.shape[1] * features.shape[2];
-  Array gains;
-  return is.array("anchor.gain", node, {count}, &gains) &&
-         is.every("anchor.gain", gains, "the gain of the sample", [&](float v, std::size_t i) {
-           const double want = static_cast<double>(v);
-           const double got = static_cast<double>(gain(anchor, &features.values[i * row]));
-           return std::abs(got - want) <= kTolerance * std::max(1.0, std::abs(want));
-         });
-}
-
-// The file's own samples must score as the file says; `gains` of an anchor, or null.
-inline bool verify(Checks& is, const Node& node, const Weights& weights, const Node* gains) {
+// The file's own samples must score, and have gains, as the file says.
+inline bool verify(Checks& is, const Node& node, const Weights& weights) {
   const Network& network = weights.network;
+  const bool added = !weights.prior_cost.incumbent.empty();
   Values found;
-  Array value, features, valid;
-  if (!(is.map("samples", node, {"features", "valid", "value"}, &found) &&
+  Array value, features, valid, gains;
+  if (!(is.map("samples", node, {"features", "valid", "value", "gain"}, &found) &&
         is.array("samples.value", *found[2], {{1, kMaxSamples}}, &value))) {
     return false;
   }
   const std::size_t count = value.values.size(), times = network.times();
   if (!(is.array("samples.features", *found[0], {count, times, network.features}, &features) &&
         is.array("samples.valid", *found[1], {count, times}, &valid) &&
-        is.every("samples.valid", valid, "0 or 1",
-                 [](float v, std::size_t) { return v == 0.0f || v == 1.0f; }))) {
+        is.every("samples.valid", valid, "0 or 1", [](float v, std::size_t) {
+          return std::equal_to<float>()(v, 0.0f) || std::equal_to<float>()(v, 1.0f);
+        }))) {
     return false;
   }
-  if ((gains != nullptr || !network.context.empty()) &&
+  if ((added || !network.context.empty()) &&
       !is.every("samples.valid", valid, "1 at the first time",
-                [&](float v, std::size_t i) { return i % times != 0 || v == 1.0f; })) {
+                [&](float v, std::size_t i) { return i % times != 0 || v > 0.0f; })) {
     return false;
   }
   std::vector<std::uint8_t> marks(valid.values.begin(), valid.values.end());
@@ -189,68 +178,71 @@ inline bool verify(Checks& is, const Node& node, const Weights& weights, const N
   std::vector<float> scored(count);
   score(network, features.values.data(), count, {marks.data(), times}, work.data(),
         scored.data());
+  const auto near = [](double got, double want) {
+    return std::abs(got - want) <= kTolerance * std::max(1.0, std::abs(want));
+  };
   for (std::size_t i = 0; i < count; ++i) {
     const double want = static_cast<double>(value.values[i]);
     const double got = static_cast<double>(scored[i]);
-    if (!(std::abs(got - want) <= kTolerance * std::max(1.0, std::abs(want)))) {
+    if (!near(got, want)) {
       return is.fail(index_text("samples", i), "scored " + number_text(got),
                      number_text(want) + " within 1e-05 of max(1, |V|)");
     }
   }
-  return gains == nullptr || verify_gains(is, *gains, weights.anchor, features);
+  if (!added) {
+    return found[3]->kind == Kind::kNil ||
+           is.fail("samples.gain", *found[3], "none without a prior cost");
+  }
+  const std::size_t row = times * network.features;
+  return is.array("samples.gain", *found[3], {count}, &gains) &&
+         is.every("samples.gain", gains, "the gain of the sample",
+                  [&](float want, std::size_t i) {
+                    const float got = gain(weights.prior_cost, &features.values[i * row]);
+                    return near(static_cast<double>(got), static_cast<double>(want));
+                  });
 }
 
 inline bool decode_seen(Checks& is, const Node& node, std::size_t features, Array* seen) {
-  if (!is.array("seen", node, {2, features}, seen)) return false;
+  if (!is.array("training_range", node, {2, features}, seen)) return false;
   const std::vector<float>& ends = seen->values;
-  return is.every("seen", *seen, "at most the highest", [&](float value, std::size_t i) {
+  return is.every("training_range", *seen, "at most the highest", [&](float value, std::size_t i) {
     return i >= features || value <= ends[i + features];
   });
 }
 
 inline bool decode_body(Checks& is, const Node& root, Weights* weights) {
   Network& network = weights->network;
-  const int version = weights->version;
-  std::vector<std::string_view> keys = {
-      "preset",     "features",    "normaliser", "times",      "gamma",  "layers",
-      "activation", "leaky_slope", "loss",       "provenance", "samples"};
-  if (version >= 3) keys.push_back("seen");
-  if (version == 4) keys.push_back("anchor");
-  const bool gated = version == 2 || (version >= 3 && is.find(root, "context") != nullptr);
-  if (gated) keys.push_back("context");
   Values body;
-  const bool mapped = is.map("body", root, keys, &body);
-  if (!(mapped && decode_features(is, *body[1], &weights->features))) return false;
-  network.features = weights->features.size();
-  if (!(decode_normaliser(is, *body[2], &network) &&
-        decode_times(is, *body[3], &weights->times) &&
-        decode_activation(is, *body[6], &network.activation))) {
+  if (!(is.map("body", root,
+               {"preset", "features", "normaliser", "training_range", "times", "gamma", "layers",
+                "activation", "leaky_slope", "scene_gating", "prior_cost", "loss", "provenance",
+                "samples"},
+               &body) &&
+        decode_features(is, *body[1], &weights->features))) {
     return false;
   }
+  const std::size_t size = network.features = weights->features.size();
+  const bool gated = body[9]->kind != Kind::kNil, added = body[10]->kind != Kind::kNil;
   Array context, seen, gamma;
-  if (gated &&
-      !is.array("context", *body.back(), {network.features, network.features}, &context)) {
-    return false;
-  }
-  if (version >= 3 && !decode_seen(is, *body[11], network.features, &seen)) return false;
-  const Node* gains = nullptr;
-  if (version == 4 &&
-      !decode_anchor(is, *body[12], network.features, &weights->anchor, &gains)) {
-    return false;
-  }
   double slope = 0.0;
-  if (!(decode_loss(is, *body[8]) && is.text("preset", *body[0], &weights->preset) &&
-        is.array("gamma", *body[4], {weights->times.size()}, &gamma) &&
-        decode_layers(is, *body[5], &network) &&
-        is.number("leaky_slope", *body[7], &slope) &&
-        is.plain("provenance", *body[9], kMaxDepth))) {
+  if (!(decode_normaliser(is, *body[2], &network) &&
+        decode_times(is, *body[4], &weights->times) &&
+        decode_activation(is, *body[7], &network.activation) &&
+        (!gated || is.array("scene_gating", *body[9], {size, size}, &context)) &&
+        decode_seen(is, *body[3], size, &seen) && decode_loss(is, *body[11]) &&
+        is.text("preset", *body[0], &weights->preset) &&
+        is.array("gamma", *body[5], {weights->times.size()}, &gamma) &&
+        decode_layers(is, *body[6], &network) &&
+        is.number("leaky_slope", *body[8], &slope) &&
+        (!added || decode_prior_cost(is, *body[10], size, &weights->prior_cost)) &&
+        is.plain("provenance", *body[12], kMaxDepth))) {
     return false;
   }
   weights->seen = std::move(seen.values);
   network.context = std::move(context.values);
   network.gamma = std::move(gamma.values);
   network.leaky_slope = narrow(slope);
-  return verify(is, *body[10], *weights, gains);
+  return verify(is, *body[13], *weights);
 }
 
 inline bool decode_outer(Checks& is, const Node& root, Weights* weights,
@@ -260,10 +252,9 @@ inline bool decode_outer(Checks& is, const Node& root, Weights* weights,
     return is.fail("magic", "missing or another", "'RCIRLW'");
   }
   const Node* version = is.find(root, "schema_version");
-  if (version == nullptr || version->kind != Kind::kUint ||
-      version->natural < 1 || version->natural > 4) {
+  if (version == nullptr || version->kind != Kind::kUint || version->natural != 1) {
     return is.fail("schema_version", version == nullptr ? Node{} : *version,
-                   "1, 2, 3 or 4, all this reader supports");
+                   "1, all this reader supports");
   }
   Values outer;
   if (!is.map("file", root, {"magic", "schema_version", "body", "sha256"}, &outer)) {
@@ -275,7 +266,6 @@ inline bool decode_outer(Checks& is, const Node& root, Weights* weights,
   if (!has_bytes || outer[3]->kind != Kind::kText || outer[3]->bytes != found) {
     return is.fail("sha256", found, show(*outer[3]) + "; the file is damaged");
   }
-  weights->version = static_cast<int>(version->natural);
   weights->sha256 = found;
   *body = outer[2]->bytes;
   return true;

@@ -220,7 +220,7 @@ inline void score_block(const Network& network, const float* features, std::size
     }
   }
   for (std::size_t k = 0; k < count; ++k) {
-    const bool finite = std::abs(total[k]) <= std::numeric_limits<float>::max();
+    const bool finite = std::abs(total[k]) <= double{std::numeric_limits<float>::max()};
     values[k] = finite && !refused[k] ? static_cast<float>(total[k])
                                       : -std::numeric_limits<float>::infinity();
   }

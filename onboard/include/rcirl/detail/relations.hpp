@@ -39,7 +39,7 @@ struct Nearest {
     for (std::size_t k = 0; k < kLanes; ++k) {
       const float best = key.at[k], offered = keys.at[k], now = speed.at[k];
       const float slower = its_speed < now ? its_speed : now;
-      const float tied = offered == best ? slower : now;
+      const float tied = offered <= best ? slower : now;
       speed.at[k] = offered < best ? its_speed : tied;
       key.at[k] = offered < best ? offered : best;
     }

@@ -1,11 +1,11 @@
-// An anchored reward: what is refused, and V_incumbent + gain V against plain loops.
+// A reward with a prior cost: what is refused, and V_incumbent + gain V against plain loops.
 #include <cmath>
 #include <cstdint>
 #include <limits>
 #include <string>
 #include <vector>
 
-#include "anchored.hpp"
+#include "with_prior_cost.hpp"
 #include "check.hpp"
 #include "rcirl/guard.hpp"
 #include "rcirl/reward.hpp"
@@ -26,7 +26,7 @@ bool close(float found, double wanted) {
 }
 
 void test_fields() {
-  const Anchored a{Example()};
+  const WithPriorCost a{Example()};
   const auto is = [&a](const std::string& key, const std::string& bytes,
                        const std::string& wanted) {
     rcirl::Reward reward;
@@ -34,31 +34,31 @@ void test_fields() {
     const std::string found = status.message();
     check(found.find("w: " + wanted) == 0, __FILE__, __LINE__, "found '" + found + "'");
   };
-  is("incumbent", pack::natural(1), "anchor.incumbent: 1: expected a text of 1 to 64");
-  is("incumbent", pack::text(""), "anchor.incumbent: : expected a text of 1 to 64");
-  is("low", pack::real(-0.5), "anchor.low: -0.5: expected at least 0");
-  is("low", pack::text("0"), "anchor.low: 0: expected a finite number");
-  is("high", pack::real(0.05), "anchor.high: 0.05: expected at least low, 0.1");
-  is("high", pack::real(HUGE_VAL), "anchor.high: inf: expected a finite number");
-  is("high", pack::natural(2), "anchor.gain[0]: ");
-  is("location", pack::filled({2}, 1.0f), "anchor.location.shape: [2]: expected [3]");
-  is("scale", pack::filled({3}, 0.0f), "anchor.scale[0]: 0: expected over 0");
-  is("kernel", pack::filled({3, 4097}, 0.0f), "anchor.kernel.shape: [3, 4097]: expected");
-  is("kernel", pack::array({3, 0}, {}), "anchor.kernel.shape: [3, 0]: expected [3, 1 to");
-  is("kernel", pack::filled({3, 5}, 0.0f), "anchor.bias.shape: [4]: expected [5]");
-  is("bias", pack::filled({4}, kNan), "anchor.bias[0]: nan: expected finite numbers");
-  is("out", pack::filled({3}, 0.0f), "anchor.out.shape: [3]: expected [4]");
-  is("offset", pack::filled({2}, 0.0f), "anchor.offset.shape: [2]: expected [1]");
-  is("gain", pack::filled({2}, 1.0f), "anchor.gain.shape: [2]: expected [3]");
-  is("gain", pack::filled({3}, 9.0f), "anchor.gain[0]: 9: expected the gain of the sample");
-  is("extra", pack::nil(), "anchor.extra: unknown: expected the keys incumbent, low");
+  is("incumbent", pack::natural(1), "prior_cost.incumbent: 1: expected a text of 1 to 64");
+  is("incumbent", pack::text(""), "prior_cost.incumbent: : expected a text of 1 to 64");
+  is("low", pack::real(-0.5), "prior_cost.low: -0.5: expected at least 0");
+  is("low", pack::text("0"), "prior_cost.low: 0: expected a finite number");
+  is("high", pack::real(0.05), "prior_cost.high: 0.05: expected at least low, 0.1");
+  is("high", pack::real(HUGE_VAL), "prior_cost.high: inf: expected a finite number");
+  is("high", pack::natural(2), "samples.gain[0]: ");
+  is("location", pack::filled({2}, 1.0f), "prior_cost.familiarity.location.shape: [2]: expected [3]");
+  is("scale", pack::filled({3}, 0.0f), "prior_cost.familiarity.scale[0]: 0: expected over 0");
+  is("kernel", pack::filled({3, 4097}, 0.0f), "prior_cost.familiarity.kernel.shape: [3, 4097]: expected");
+  is("kernel", pack::array({3, 0}, {}), "prior_cost.familiarity.kernel.shape: [3, 0]: expected [3, 1 to");
+  is("kernel", pack::filled({3, 5}, 0.0f), "prior_cost.familiarity.bias.shape: [4]: expected [5]");
+  is("bias", pack::filled({4}, kNan), "prior_cost.familiarity.bias[0]: nan: expected finite numbers");
+  is("out", pack::filled({3}, 0.0f), "prior_cost.familiarity.out.shape: [3]: expected [4]");
+  is("offset", pack::filled({2}, 0.0f), "prior_cost.familiarity.offset.shape: [2]: expected [1]");
+  is("gain", pack::filled({2}, 1.0f), "samples.gain.shape: [2]: expected [3]");
+  is("gain", pack::filled({3}, 9.0f), "samples.gain[0]: 9: expected the gain of the sample");
+  is("extra", pack::nil(), "prior_cost.extra: unknown: expected the keys incumbent, low");
 }
 
 void test_the_total_equals_plain_loops() {
   for (const bool by_context : {false, true}) {
-    Anchored a(Example(5, 4, {6}, "tanh", by_context));
+    WithPriorCost a(Example(5, 4, {6}, "tanh", by_context));
     const rcirl::Reward reward = loaded(a.file());
-    CHECK(reward.version() == 4 && reward.anchored() && reward.incumbent() == "hand-set");
+    CHECK(reward.has_prior_cost() && reward.incumbent() == "hand-set");
     rcirl::Workspace workspace = reward.workspace();
     for (const std::size_t count : {0u, 1u, 32u, 70u}) {
       const std::vector<float> features = a.example.inputs(count, 5);
@@ -88,7 +88,7 @@ void test_the_total_equals_plain_loops() {
 }
 
 void test_a_candidate_without_a_total_is_refused_alone() {
-  const Anchored a{Example()};
+  const WithPriorCost a{Example()};
   const rcirl::Reward reward = loaded(a.file());
   rcirl::Workspace workspace = reward.workspace();
   const std::size_t count = 6, row = 12;
@@ -105,7 +105,7 @@ void test_a_candidate_without_a_total_is_refused_alone() {
   for (const std::size_t k : {0u, 2u, 3u, 4u}) CHECK(values[k] == kNone);
   CHECK(values[1] != kNone && values[5] != kNone);
   own.assign(count, 3.4e38f);
-  Anchored steep{Example()};
+  WithPriorCost steep{Example()};
   steep.low = steep.high = 1e38;
   const rcirl::Reward much = loaded(steep.file());
   features = a.example.inputs(count, 6);
@@ -117,10 +117,10 @@ void test_a_candidate_without_a_total_is_refused_alone() {
   CHECK(much.total(features.data(), count, {}, own.data(), &workspace, values.data()) == beyond);
 }
 
-void test_without_an_anchor_or_a_workspace() {
-  const Anchored a{Example()};
+void test_without_a_prior_cost_or_a_workspace() {
+  const WithPriorCost a{Example()};
   const rcirl::Reward plain = loaded(a.example.file()), reward = loaded(a.file());
-  CHECK(!plain.anchored() && plain.incumbent().empty());
+  CHECK(!plain.has_prior_cost() && plain.incumbent().empty());
   rcirl::Workspace workspace = plain.workspace(), none;
   const std::vector<float> features = a.example.inputs(2, 9), own = {1.0f, 2.0f};
   float values[2];
@@ -132,7 +132,7 @@ void test_without_an_anchor_or_a_workspace() {
 }
 
 void test_the_guard_judges_the_features_of_v() {
-  const Anchored a{Example()};
+  const WithPriorCost a{Example()};
   const rcirl::Reward reward = loaded(a.file());
   const std::vector<float> inside(12, 0.0f), beyond(12, 1e9f);
   CHECK(rcirl::Guard(reward).check(inside.data(), 1, {}).in_distribution);
@@ -145,7 +145,7 @@ int main() {
   test_fields();
   test_the_total_equals_plain_loops();
   test_a_candidate_without_a_total_is_refused_alone();
-  test_without_an_anchor_or_a_workspace();
+  test_without_a_prior_cost_or_a_workspace();
   test_the_guard_judges_the_features_of_v();
   return failures == 0 ? 0 : 1;
 }
