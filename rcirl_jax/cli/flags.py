@@ -12,6 +12,7 @@ from typing import Any
 
 from absl import flags
 
+from rcirl_jax.cli.running import AS_SAID, HEADINGS
 from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.inputs import InputFile
 from rcirl_jax.data.scenes.config import SignalChecks, signal_checks
@@ -35,8 +36,6 @@ from rcirl_jax.train.state import (
 from rcirl_jax.train.trackers import TRACKERS
 from rcirl_jax.tuning.recipes import DEFAULT, Recipe, load_recipe, override
 
-AS_SAID = " (default: the recipe's)"  # of a flag beside a recipe; help shows its value
-HEADINGS: dict[str, str] = {}  # in `--helpfull`, by the name of a shared flag
 OUTPUT = "folder of the run; a run that is in it goes on"
 
 

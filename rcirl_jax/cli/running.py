@@ -22,7 +22,6 @@ from typing import NoReturn, TextIO
 import jax
 from absl import app, flags, logging
 
-from rcirl_jax.cli.flags import AS_SAID, HEADINGS, recipes_default
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError, did_you_mean, extra_of
 from rcirl_jax.export.reader import load_weights
@@ -46,6 +45,8 @@ FLAG_OF = {
     "recordings": "traffic",
     "track": "filter",
 }
+AS_SAID = " (default: the recipe's)"  # of a flag beside a recipe; help shows its value
+HEADINGS: dict[str, str] = {}  # in `--helpfull`, by the name of a shared flag
 OURS = ("rcirl_jax.cli.", "experiments.")  # modules whose flags are a command's
 SHORT = ("-h", "-?", "-help", "--help", "--helpshort")
 FULL = ("-helpfull", "--helpfull")
@@ -293,8 +294,12 @@ def _line(flag: flags.Flag) -> str:
     """A flag, what it is and its default, in as few lines as it takes."""
     name = f"  --{'[no]' if flag.boolean else ''}{flag.name}"
     said = re.sub(r"^<.*?>: ", "", str(flag.help))  # absl's list of an enum's values
-    default = recipes_default(flag.name) if said.endswith(AS_SAID) else ""
-    said = said.removesuffix(AS_SAID)
+    default = ""
+    if said.endswith(AS_SAID):
+        # of a command with recipes; the others start without loading them
+        from rcirl_jax.cli.flags import recipes_default
+
+        said, default = said.removesuffix(AS_SAID), recipes_default(flag.name)
     if values := getattr(flag.parser, "enum_values", None):
         said += f": {', '.join(values)}"
     if flag.default not in (None, "", []) and flag.default is not False:
