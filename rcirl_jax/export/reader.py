@@ -91,7 +91,7 @@ class PriorCost:
 
     @np.errstate(all="ignore")
     def gain(self, first: np.ndarray) -> np.ndarray:
-        """Gains of V, summed in float64.
+        """Return gains of V, summed in float64.
 
         Args:
           first: [..., F] raw features at the first time.
@@ -297,7 +297,7 @@ def load_weights(path: str | os.PathLike[str]) -> Reward:
 
 
 def decode_weights(data: bytes, file: str = "weights") -> Reward:
-    """As `load_weights`, from bytes; `file` is their name in messages."""
+    """Decode as `load_weights`, from bytes; `file` is their name in messages."""
     try:
         return _decode(data, file)
     except WeightsError as error:
@@ -379,7 +379,7 @@ def _features(value: object) -> dict[str, tuple[Any, ...]]:
 
 
 def _layers(value: object, width: int) -> dict[str, tuple[np.ndarray, ...]]:
-    """The chain F -> ... -> 1."""
+    """Return the chain F -> ... -> 1."""
     kernels, biases = [], []
     for index, row in enumerate(_list("layers", value, MAX_LAYERS)):
         at = f"layers[{index}]"
@@ -394,7 +394,7 @@ def _layers(value: object, width: int) -> dict[str, tuple[np.ndarray, ...]]:
 
 
 def _prior_cost(value: object, features: int) -> PriorCost:
-    """The prior cost, checked but for the gains of the samples."""
+    """Return the prior cost, checked but for the gains of the samples."""
     box = _map("prior_cost", value, PRIOR_COST_KEYS)
     text = _text("prior_cost.incumbent", box["incumbent"])
     low, high = (_number(f"prior_cost.{key}", box[key]) for key in ("low", "high"))
@@ -423,7 +423,7 @@ def _prior_cost(value: object, features: int) -> PriorCost:
 
 
 def _plain(field: str, value: Any, depth: int) -> Any:  # noqa: ANN401
-    """A map of what JSON can say: texts, finite numbers, lists, maps."""
+    """Check a map of what JSON can say: texts, finite numbers, lists, maps."""
     if depth == MAX_DEPTH and not isinstance(value, dict):
         _fail(field, value, "a map")
     if isinstance(value, dict | list) and depth > 0:
@@ -435,7 +435,7 @@ def _plain(field: str, value: Any, depth: int) -> Any:  # noqa: ANN401
 
 
 def _verify(reward: Reward, samples: object) -> None:
-    """The file's own samples must score, and have gains, as the file says."""
+    """Check that the file's samples score, and have gains, as the file says."""
     found = _map("samples", samples, SAMPLE_KEYS)
     wanted = _array("samples.value", found["value"], (range(1, MAX_SAMPLES + 1),))
     shape = (len(wanted), len(reward.times), len(reward.names))
@@ -463,7 +463,7 @@ def _verify(reward: Reward, samples: object) -> None:
 
 
 def _unpack(field: str, data: bytes) -> object:
-    """One msgpack object with nothing behind it; no ext types, bounded memory."""
+    """Unpack one msgpack object, nothing behind it; no ext types, bounded memory."""
     nodes = 0
 
     def on_list(items: list[Any]) -> list[Any]:
@@ -500,7 +500,7 @@ def _unpack(field: str, data: bytes) -> object:
 
 
 def _show(value: object) -> str:
-    """A value as short text; never the inside of a list, map or bytes."""
+    """Return a value as short text; never the inside of a list, map or bytes."""
     if isinstance(value, dict | list | bytes):
         return f"{type(value).__name__} of {len(value)}"
     text = f"{value:.9g}" if isinstance(value, float | np.floating) else str(value)
@@ -512,7 +512,7 @@ def _fail(field: str, value: object, expected: str) -> NoReturn:
 
 
 def _map(field: str, value: object, keys: tuple[str, ...]) -> dict[str, Any]:
-    """A map with exactly these keys."""
+    """Return a map with exactly these keys."""
     if not isinstance(value, dict):
         _fail(field, value, "a map")
     for key in (*keys, *value):
@@ -541,7 +541,7 @@ def _number(field: str, value: Any, expected: str = "a finite number") -> float:
 
 
 def _array(field: str, value: object, shape: tuple[int | range, ...]) -> np.ndarray:
-    """A finite float32 array; an axis is given by its length or its limits."""
+    """Return a finite float32 array; an axis has a length or limits."""
     box = _map(field, value, ("shape", "dtype", "data"))
     axes, data = box["shape"], box["data"]
     if box["dtype"] != "<f4":

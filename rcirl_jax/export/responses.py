@@ -35,7 +35,7 @@ class Response:
 def responses(
     reward: Reward, mine: np.ndarray, theirs: np.ndarray, valid: np.ndarray
 ) -> dict[str, Response]:
-    """Curves of all features that the reward uses.
+    """Return curves of all features that the reward uses.
 
     Args:
       reward: V is its `value`, also where it has a prior cost.
@@ -70,14 +70,14 @@ def responses(
 
 
 def _around(reward: Reward, i: int) -> tuple[float, float]:
-    """A feature's range in training, and a quarter of it more on either side."""
+    """Return a feature's range in training, a quarter of it more on either side."""
     low, high = float(reward.lower[i]), float(reward.upper[i])
     more = 0.25 * (high - low)
     return low - more, high + more
 
 
 def prices(reward: Reward, mine: np.ndarray, valid: np.ndarray) -> dict[str, float]:
-    """V per unit of each feature that the reward uses; arguments as of `responses`.
+    """Return V per unit of each feature; arguments as of `responses`.
 
     Where the data lie at an end of a feature's range, the step beyond it counts as the
     reward has it: as nothing.

@@ -80,7 +80,7 @@ def pack(
     samples_valid: np.ndarray,
     samples_value: np.ndarray,
 ) -> bytes:
-    """The bytes of the file, checked by reading them back.
+    """Return the bytes of the file, checked by reading them back.
 
     Args:
       weights: effective weights.
@@ -124,7 +124,7 @@ def save(
 
 
 def to_json(data: bytes) -> dict[str, Any]:
-    """The body as JSON types: what data_specs/reward_weights.schema.json describes.
+    """Return the body as JSON types, as data_specs/reward_weights.schema.json says.
 
     An array keeps its map {shape, dtype, data}; `data` turns from bytes into
     base64 text, so nothing is lost.
@@ -240,7 +240,7 @@ def _array(field: str, value: np.ndarray) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401
-    """The same with map keys sorted, and numpy scalars as Python numbers."""
+    """Sort the keys of maps; turn numpy scalars into Python numbers."""
     if isinstance(value, Mapping):
         return {key: _plain(value[key]) for key in sorted(value)}
     if isinstance(value, list | tuple):

@@ -152,7 +152,7 @@ def _shares_of(
 
 @functools.cache
 def _absolute(preset: str, sampler: SamplerConfig, activation: str) -> Callable:
-    """(weights, rows [S], scenes [S]) -> mean |contribution| [S, F], and features."""
+    """Return a program: weights, rows [S], scenes [S] -> mean |contribution| [S, F]."""
     features = feature_map(preset)
 
     def one(

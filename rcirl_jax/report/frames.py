@@ -124,7 +124,7 @@ def _driven_by(
     x: np.ndarray,
     mask: np.ndarray,
 ) -> np.ndarray:
-    """[K] what the candidates are ranked by: V, on top of the prior cost if any."""
+    """Return [K] what ranks the candidates: V, on top of the prior cost if any."""
     if reward.prior_cost is None:
         return reward.value(x, mask)
     own, weights = incumbent_score(reward.prior_cost.incumbent)

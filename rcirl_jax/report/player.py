@@ -135,7 +135,7 @@ def case_lines(
 
 
 def _drive(metrics: CaseMetrics, at: int) -> CaseMetrics:
-    """One case's numbers."""
+    """Return one case's numbers."""
     return jax.tree.map(lambda x: np.asarray(x)[at], metrics)
 
 

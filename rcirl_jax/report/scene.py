@@ -72,19 +72,19 @@ class View:
     high: float  # m, highest
 
     def first(self, slot: int) -> int:
-        """Index of the first time at which the slot is known."""
+        """Return the index of the first time at which the slot is known."""
         return int(np.argmax(self.rows.scene.obstacles.valid[slot]))
 
     def decision(self, slot: int) -> Decision:
-        """The label of the slot."""
+        """Return the label of the slot."""
         return Decision(int(self.rows.decisions[slot]))
 
     def kind(self, slot: int) -> Kind:
-        """What is in the slot."""
+        """Return what is in the slot."""
         return Kind(int(self.rows.scene.obstacles.kind[slot]))
 
     def inside(self, slot: int) -> bool:
-        """Whether the first box, or a line, lies in the window."""
+        """Return whether the first box, or a line, lies in the window."""
         at, obstacles = self.first(slot), self.rows.scene.obstacles
         ends = obstacles.s_lower[slot, at], obstacles.s_upper[slot, at]
         return bool(ends[1] >= self.low and ends[0] <= self.high)

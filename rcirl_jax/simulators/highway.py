@@ -76,7 +76,7 @@ class HighwayEnv:
         return drawn_names(list(KINDS), count, seed)
 
     def start(self, episodes: Sequence[str], own: str | None) -> LockStep:
-        """Separate environments, stepped one after the other."""
+        """Begin separate environments, stepped one after the other."""
         return LockStep([HighwayEpisode(name, own) for name in episodes])
 
 

@@ -38,7 +38,7 @@ FRENETIX_NONE = (
 
 
 def linear_costs(reward: Reward) -> tuple[np.ndarray, np.ndarray]:
-    """(above [F], below [F]): cost per unit of departure from `reward.location`.
+    """Return (above [F], below [F]): cost per unit of departure from the usual.
 
     Raises:
       InputError: the reward is not linear, or not in departures from the usual.
@@ -66,7 +66,7 @@ def linear_costs(reward: Reward) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reward_yaml(reward: Reward) -> str:
-    """The document of a linear reward."""
+    """Return the document of a linear reward."""
     above, below = linear_costs(reward)
     lines = _head({"weights_sha256": reward.sha256, "preset": reward.preset})
     lines += [
@@ -125,7 +125,7 @@ def _head(source: Mapping[str, str]) -> list[str]:
 
 
 def _number(value: float) -> str:
-    """Seven digits; YAML 1.1 reads an exponent as a number only after a point."""
+    """Format seven digits; YAML 1.1 reads an exponent only after a point."""
     text = f"{float(value):.7g}"
     if "e" in text and "." not in text:
         text = text.replace("e", ".0e")

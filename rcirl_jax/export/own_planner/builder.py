@@ -48,7 +48,7 @@ def scene_from(
     path: Any = None,  # noqa: ANN401
     destination: tuple[float, float] | None = None,
 ) -> Scene:
-    """The planning frame of one moment; `plain_scene` turns it into plain numbers.
+    """Build the planning frame of one moment; `plain_scene` makes it plain numbers.
 
     Args:
       ego: the car that is planned for.
@@ -91,7 +91,7 @@ def scene_from(
 
 
 def scene_of(parts: Parts) -> Scene:
-    """The planning frame of one moment; pure, so that many are made by one `vmap`."""
+    """Build the planning frame of one moment; pure, so that `vmap` makes many."""
     return Scene(
         ego=parts.ego,
         path=parts.path,
@@ -109,7 +109,7 @@ _scene_of = jax.jit(scene_of)
 def _futures(
     frame: LineFrame, others: Sequence[Body], predictions: Sequence[Any], s0: float
 ) -> dict[str, np.ndarray]:
-    """Boxes of given futures at the T times; all [M, T]."""
+    """Return boxes of given futures at the T times; all [M, T]."""
     if len(predictions) != len(others):
         raise InputError(
             f"scene_from: predictions: {len(predictions)}: expected {len(others)}, one "
@@ -145,7 +145,7 @@ def _futures(
 
 
 def _with_futures(seen: Obstacles, futures: dict, first: jax.Array) -> Obstacles:
-    """Obstacles whose bodies have the given futures instead of predicted ones."""
+    """Return obstacles with the given futures instead of predicted ones."""
     count = len(futures["speed"])
     leaves = {}
     for name, values in futures.items():

@@ -71,7 +71,7 @@ class Signal:
 
 
 def check(field: str, value: object, good: object, expected: str) -> None:
-    """One line on a field where it is not good.
+    """Refuse a field in one line where it is not good.
 
     Raises:
       InputError: "scene_from: FIELD: VALUE: expected EXPECTED".
@@ -81,14 +81,14 @@ def check(field: str, value: object, good: object, expected: str) -> None:
 
 
 def check_one_of(field: str, value: object, known: Sequence[str]) -> None:
-    """A name has to be a known one."""
+    """Refuse a name that is not known."""
     if value not in known:
         names = ", ".join(known)
         check(field, value, False, f"one of {names}{did_you_mean(str(value), known)}")
 
 
 def floats(field: str, given: Any) -> np.ndarray:  # noqa: ANN401
-    """Finite float64 numbers that a road may have."""
+    """Return finite float64 numbers that a road may have."""
     try:
         array = np.asarray(given, float)
     except (TypeError, ValueError):
@@ -99,7 +99,7 @@ def floats(field: str, given: Any) -> np.ndarray:  # noqa: ANN401
 
 
 def table(field: str, given: Any, columns: int) -> np.ndarray:  # noqa: ANN401
-    """Finite numbers [n, columns], n at least 1."""
+    """Return finite numbers [n, columns], n at least 1."""
     array = floats(field, given)
     good = array.ndim == 2 and array.shape[1] == columns and len(array) > 0
     check(field, f"shape {array.shape}", good, f"rows of {columns} numbers")
@@ -107,7 +107,7 @@ def table(field: str, given: Any, columns: int) -> np.ndarray:  # noqa: ANN401
 
 
 def polyline(field: str, given: Any) -> np.ndarray:  # noqa: ANN401
-    """Points [m, 2] of a line of some length; steps below a millimetre do not count."""
+    """Return points [m, 2] of a line; steps below a millimetre do not count."""
     points = table(field, given, 2)
     steps = np.hypot(*np.diff(points, axis=0).T)
     length = float(np.sum(steps[steps > SAME_PLACE_M]))
@@ -117,7 +117,7 @@ def polyline(field: str, given: Any) -> np.ndarray:  # noqa: ANN401
 
 
 def check_numbers(name: str, given: Car | Body | Signal) -> None:
-    """Every number of a car, a body or a signal has to be finite and in range."""
+    """Check that every number of a car, a body or a signal is finite, in range."""
     for field in _number_fields(type(given)):
         value = getattr(given, field)
         if type(value) is not float or not abs(value) <= MOST:
@@ -135,6 +135,6 @@ def _number_fields(kind: type) -> tuple[str, ...]:
 
 
 def check_radians(field: str, heading: float) -> None:
-    """A heading of many turns is one in degrees."""
+    """Refuse a heading of many turns: it is one in degrees."""
     good = abs(heading) <= MOST_RAD
     check(field, f"{heading:g}", good, "radians, not degrees")

@@ -90,7 +90,7 @@ class LineFrame:
         signals: Sequence[Signal] = (),
         destination: tuple[float, float] | None = None,
     ) -> np.ndarray:
-        """Places [q, 2] m of a moment, from the origin, to be projected on the line.
+        """Return places [q, 2] m of a moment, to be projected on the line.
 
         Those of the ego, the obstacles, the signals and, if any, the destination.
 
@@ -114,7 +114,7 @@ class LineFrame:
         path: Any = None,  # noqa: ANN401
         slots: int = 0,
     ) -> Parts:
-        """One moment on the line; see `scene_from`.
+        """Return one moment on the line; see `scene_from`.
 
         Args:
           s: [q] m, stations of `points`.
@@ -141,24 +141,24 @@ class LineFrame:
         )
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(s, l) m of points [q, 2] m."""
+        """Return (s, l) m of points [q, 2] m."""
         s, l = project_points(self.line, np.asarray(points, float) - self.origin)
         return s.astype(float), l.astype(float)
 
     def table(self, name: str, s: np.ndarray | float) -> np.ndarray:
-        """Heading or curvature of the line at stations; straight beyond its end."""
+        """Return heading or curvature at stations; straight beyond the line's end."""
         values = self.tables[name]
         beyond = 0.0 if name == "kappa" else None
         return np.asarray(np.interp(s, self.grid, values, right=beyond))
 
     def tilt(self, s: np.ndarray | float, heading: np.ndarray | float) -> np.ndarray:
-        """Headings against the line's, in (-pi, pi]."""
+        """Return headings against the line's, in (-pi, pi]."""
         apart = np.asarray(heading) - self.table("heading", s)
         return np.arctan2(np.sin(apart), np.cos(apart))
 
 
 def _ego(frame: LineFrame, ego: Car, s0: float, l: float) -> Ego:
-    """The ego in the frame, from its station and offset on the line."""
+    """Return the ego in the frame, from its station and offset on the line."""
     ahead, need = frame.length - s0, HORIZON_S * ego.speed
     if s0 < -1e-3:
         raise InputError(
@@ -196,7 +196,7 @@ def _ego(frame: LineFrame, ego: Car, s0: float, l: float) -> Ego:
 
 
 def _path(frame: LineFrame, path: Any, s0: float) -> Path:  # noqa: ANN401
-    """The line from the ego on, with limits that look ahead (`geometry.limits`)."""
+    """Return the line from the ego on, with limits that look ahead."""
     road = frame.road
     stations = s0 + LONG_GRID_M
     kappa = frame.table("kappa", stations)
@@ -226,7 +226,7 @@ def _path(frame: LineFrame, path: Any, s0: float) -> Path:  # noqa: ANN401
 
 
 def _posted_limits(frame: LineFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Stations [m] m from which posted limits [m] m/s hold."""
+    """Return stations [m] m from which posted limits [m] m/s hold."""
     limits = np.atleast_1d(floats("centre_line.speed_limit", frame.road.speed_limit))
     check("centre_line.speed_limit", limits, np.all(limits > 0.0), "over 0 m/s")
     if limits.shape == (1,):
@@ -241,7 +241,7 @@ def _posted_limits(frame: LineFrame) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check_others(others: Sequence[Body], signals: Sequence[Signal]) -> None:
-    """Every number of the others and every name has to be a known one."""
+    """Check every number of the others and every name."""
     for n, body in enumerate(others):
         check_numbers(f"obstacles[{n}]", body)
         check_one_of(f"obstacles[{n}].kind", body.kind, BODY_KINDS)
@@ -258,7 +258,7 @@ def _bodies(
     s0: float,
     slots: int,
 ) -> Bodies:
-    """The others in the frame, s from the ego on; filled up to few sizes."""
+    """Return the others in the frame, s from the ego on; filled up to few sizes."""
     size = max(8, slots, 1 << (len(others) - 1).bit_length())  # few compilations
     rows = np.zeros((size, 6))
     kinds = np.zeros(size, np.int32)
@@ -282,21 +282,21 @@ def _bodies(
 
 
 def _floats(values: Mapping[str, Any]) -> dict[str, Any]:
-    """As numpy's float32, leaves of a tree that JAX is given."""
+    """Return numpy's float32, leaves of a tree that JAX is given."""
     return {name: np.asarray(x, np.float32) for name, x in values.items()}
 
 
 def extents(
     length: np.ndarray, width: np.ndarray, tilt: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Half extents [q] m along and across the line of boxes tilted to it."""
+    """Return half extents [q] m along and across the line of tilted boxes."""
     given = (np.asarray(x, np.float32) for x in (length, width, tilt))
     along, across = _extents_of(*given)
     return np.asarray(along), np.asarray(across)
 
 
 def _nearest_line(signals: Sequence[Signal], stations: np.ndarray, now: Ego) -> float:
-    """Station of the nearest line ahead of the front that demands a stop; inf: none.
+    """Return the station of the nearest line ahead that demands a stop; inf: none.
 
     Yellow does where the ego can still stop, as in the simulator.
     """

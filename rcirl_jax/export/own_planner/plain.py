@@ -10,7 +10,7 @@ PATH = ("kappa", "l", "speed_limit")
 
 
 def plain_scene(scene: Scene) -> features.Scene:
-    """One scene in plain numbers; what is never there is left out."""
+    """Return one scene in plain numbers; leave out what is never there."""
     ego = {name: float(value) for name, value in vars(scene.ego).items()}
     kinds = np.asarray(scene.obstacles.kind)
     tables = {name: np.asarray(getattr(scene.obstacles, name)) for name in BOX}
