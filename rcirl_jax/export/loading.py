@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.ranking.score import OnTop
+from rcirl_jax.evaluation.ranking.score import PriorCostScorer
 from rcirl_jax.export.reader import PriorCost, Reward, WeightsError, load_weights
 from rcirl_jax.features.mapping import FeatureMap, feature_map, known_presets
 from rcirl_jax.reward.familiarity import Familiarity
@@ -119,11 +119,11 @@ def familiarity_of(prior_cost: PriorCost) -> Familiarity:
     return Familiarity(**arrays, offset=offset)
 
 
-def scorer_of(reward: Reward) -> Scorer | OnTop:
+def scorer_of(reward: Reward) -> Scorer | PriorCostScorer:
     """Return the reward as a row of rankings: V, on top of its prior cost if any."""
     if reward.prior_cost is None:
         return reward.value
-    return OnTop(incumbent=reward.prior_cost.incumbent, total=reward.total)
+    return PriorCostScorer(incumbent=reward.prior_cost.incumbent, total=reward.total)
 
 
 def compiled_scorer(reward: Reward) -> Scorer:
@@ -240,7 +240,7 @@ def prior_cost_words(name: str, reward: Reward) -> str:
 
 def load_runs(
     paths: Sequence[str],
-) -> tuple[dict[str, list[Scorer | OnTop]], str, SamplerConfig]:
+) -> tuple[dict[str, list[Scorer | PriorCostScorer]], str, SamplerConfig]:
     """Return scorers by row (files of one loss and shape are its seeds).
 
     Where two of them have the same seed, each file is a row, as `row_names` has it.
@@ -257,7 +257,7 @@ def load_runs(
             f"weights: {sorted(settings)}: expected files of one preset and mode"
         )
     preset, mode = settings.pop()
-    runs: dict[str, list[Scorer | OnTop]] = {}
+    runs: dict[str, list[Scorer | PriorCostScorer]] = {}
     for reward, own, row in zip(
         rewards, row_names(rewards), _rows(rewards), strict=True
     ):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.ranking.score import OnTop
+from rcirl_jax.evaluation.ranking.score import PriorCostScorer
 from rcirl_jax.export.closed_loop import score_of, table_rows
 from rcirl_jax.export.loading import open_reward, reward_params, scorer_of
 from rcirl_jax.export.reader import PriorCost
@@ -54,7 +54,7 @@ def test_the_gain_goes_from_low_to_high_with_the_familiarity(tmp_path, offset, g
     total = reward.total(features, np.asarray(theirs), valid)
     np.testing.assert_allclose(total, found, rtol=1e-4, atol=1e-3)
     scorer = scorer_of(reward)
-    assert isinstance(scorer, OnTop)
+    assert isinstance(scorer, PriorCostScorer)
     assert scorer.incumbent == "hand-set"
     ranked = scorer.total(features, np.asarray(theirs), valid)
     np.testing.assert_array_equal(ranked, total)

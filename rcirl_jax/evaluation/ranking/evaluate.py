@@ -20,7 +20,7 @@ from rcirl_jax.evaluation.ranking.metrics import (
 from rcirl_jax.evaluation.ranking.score import (
     BASELINES,
     Baseline,
-    OnTop,
+    PriorCostScorer,
     Scored,
     Scorer,
     covers,
@@ -93,7 +93,7 @@ def outcomes_of(scored: Scored, rows: Demonstration, setup: RankingSetup) -> Out
 def _temperatures(
     dataset: Demonstrations,
     setup: RankingSetup,
-    scorers: Mapping[str, Scorer | OnTop],
+    scorers: Mapping[str, Scorer | PriorCostScorer],
     executor: Executor | None,
 ) -> dict[str, float]:
     """Scale of each row's values, fitted on TRAINING scenes."""
@@ -119,7 +119,7 @@ def score_rows(
     rows: Demonstration,
     index: np.ndarray,
     setup: RankingSetup,
-    scorers: Mapping[str, Scorer | OnTop],
+    scorers: Mapping[str, Scorer | PriorCostScorer],
     executor: Executor | None = None,
 ) -> Scored:
     """`score_scenes` of a setup; its tuned baselines by the names of `numbered`."""
@@ -148,7 +148,7 @@ class Ranked:
 
 def rank_scenes(
     dataset: Demonstrations,
-    learned: Mapping[str, Sequence[Scorer | OnTop]],
+    learned: Mapping[str, Sequence[Scorer | PriorCostScorer]],
     setup: RankingSetup,
     executor: Executor | None = None,
 ) -> Ranked:
@@ -231,7 +231,7 @@ def report_of(ranked: Ranked, references: Sequence[str] | None = None) -> Rankin
 
 def evaluate_ranking(
     dataset: Demonstrations,
-    learned: Mapping[str, Sequence[Scorer | OnTop]],
+    learned: Mapping[str, Sequence[Scorer | PriorCostScorer]],
     setup: RankingSetup,
     executor: Executor | None = None,
     references: Sequence[str] | None = None,

@@ -61,7 +61,7 @@ Scorer = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class OnTop:
+class PriorCostScorer:
     """A reward on top of a baseline's values."""
 
     incumbent: str  # of BASELINES
@@ -195,7 +195,7 @@ def score_scenes(
     preset: str,
     sampler: SamplerConfig,
     horizon_s: float,
-    scorers: Mapping[str, Scorer | OnTop],
+    scorers: Mapping[str, Scorer | PriorCostScorer],
     futures: str = "predicted",
     tuned: Mapping[str, Baseline] | None = None,
     executor: Executor | None = None,
@@ -312,7 +312,7 @@ def chunks(
 def _score_chunk(
     item: tuple[Demonstration, np.ndarray, int],
     shared: tuple[str, SamplerConfig, float, str],
-    scorers: Mapping[str, Scorer | OnTop],
+    scorers: Mapping[str, Scorer | PriorCostScorer],
     tuned: Mapping[str, Baseline],
 ) -> Iterator[dict]:
     """The arrays of one padded chunk; (rows, index, how many are real)."""
@@ -343,7 +343,7 @@ def _not_finite(
     return {n: ~np.logical_and.reduce([*map(fine, xs)]) for n, xs in found.items()}
 
 
-def _with_values(made: dict, scorers: Mapping[str, Scorer | OnTop]) -> dict:
+def _with_values(made: dict, scorers: Mapping[str, Scorer | PriorCostScorer]) -> dict:
     """Replace the features of a chunk by the scorers' values."""
     valid = made.pop("time_valid")
     of_candidates, of_human = made.pop("features"), made.pop("features_human")
@@ -354,7 +354,7 @@ def _with_values(made: dict, scorers: Mapping[str, Scorer | OnTop]) -> dict:
     )
     for name, scorer in scorers.items():
         for values, features, counts in tables:
-            if isinstance(scorer, OnTop):
+            if isinstance(scorer, PriorCostScorer):
                 values[name] = scorer.total(features, values[scorer.incumbent], counts)
             else:
                 values[name] = scorer(features, counts)
