@@ -107,42 +107,40 @@ def reading_of(
         table = tables[own] = {}
         fields = {field.name: field for field in found.field}
         for place, (name, want) in enumerate(wanted.items()):
-            if name in fields:
-                table[name] = described(fields[name], want, f"{kind}.{name}")
-            elif kind is not None and name in NEEDED:
+            if kind is not None and name in NEEDED and name not in fields:
                 raise DecodeError(f"field {name}: not among the descriptors")
-            else:
-                table[name] = field_of(None, "double", LACKING - place, name, want)
+            table[name] = field_for(
+                fields.get(name), LACKING - place, f"{kind}.{name}", want
+            )
         return own
 
-    def described(field: pb.FieldDescriptorProto, want: Any, where: str) -> Field:  # noqa: ANN401 - see Wanted
-        kind = field.Type.Name(field.type).removeprefix("TYPE_").lower()
-        if isinstance(want, dict | list):
-            fits = kind == "message"
-        else:
-            fits = kind == ENUM if want == ENUM else kind not in NO_NUMBERS
-        repeated = field.label == field.LABEL_REPEATED
-        if repeated != isinstance(want, list) or not fits:
-            raise DecodeError(f"{where}: type {kind}: another is known")
-        below = str(field.type_name).lstrip(".")
-        return field_of(below, kind, field.number, str(field.name), want)
-
-    def field_of(
-        below: str | None,
-        kind: str,
+    def field_for(
+        field: pb.FieldDescriptorProto | None,
         number: int,
-        name: str,
+        where: str,
         want: Any,  # noqa: ANN401 - see Wanted
     ) -> Field:
+        """Makes a field; one that a release lacks by a number that no message has."""
+        kind, below, is_list = "double", None, isinstance(want, list)
+        if field is not None:
+            kind = field.Type.Name(field.type).removeprefix("TYPE_").lower()
+            number, below = field.number, str(field.type_name).lstrip(".")
+            if isinstance(want, dict | list):
+                fits = kind == "message"
+            else:
+                fits = kind == ENUM if want == ENUM else kind not in NO_NUMBERS
+            if is_list != (field.label == field.LABEL_REPEATED) or not fits:
+                raise DecodeError(f"{where}: type {kind}: another is known")
         if isinstance(want, dict | list):
             inner = want[0] if isinstance(want, list) else want
-            return Field(table_for(below, inner), number, isinstance(want, list))
+            return Field(table_for(below, inner), number, is_list)
         if want == ENUM:
             values = getattr(known.get(below or ""), "value", ())
+            name = where.rpartition(".")[2]
             names[name] = {value.number: value.name for value in values}
             return Field("int32", number, default=str(UNSET))
-        is_real = kind in ("double", "float")
-        return Field(kind, number, default="nan" if is_real and want != want else "")
+        is_unset = kind in ("double", "float") and math.isnan(want)
+        return Field(kind, number, default="nan" if is_unset else "")
 
     table_for(message, wanted)
     try:
@@ -332,10 +330,9 @@ def read_drive(files: list[Path], spec: dict) -> Iterator[Rows]:
             show(size)
 
         for file in files:
-            with Record(file) as record:
-                for rows in _read_file(record, topics, numbers, undescribed, count):
-                    rows.progress = min(done / max(total, 1), 1.0)
-                    yield rows
+            for rows in _read_file(Record(file), topics, numbers, undescribed, count):
+                rows.progress = min(done / max(total, 1), 1.0)
+                yield rows
     if undescribed and not any(numbers.values()):
         channel, why = next(iter(undescribed.items()))
         raise InputError(f"{files[0]}: {channel}: {why}: expected an Apollo message")

@@ -8,7 +8,6 @@ the messages. The index at the end is not needed: sections are walked from the
 start, so records that were never closed can be read as well.
 """
 
-import contextlib
 import mmap
 import re
 import struct
@@ -92,28 +91,13 @@ def _drive_and_part(file: Path) -> tuple[Path, int]:
 
 
 class Record:
-    """One record file, mapped into memory; use as a context manager."""
+    """One record file; its messages are read once."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         # channel -> (message type, its descriptors: a ProtoDesc)
         self.channels: dict[str, tuple[str, bytes]] = {}
         self.is_complete = True
-
-    def __enter__(self) -> "Record":
-        try:
-            with self.path.open("rb") as handle:
-                self._map = mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ)
-        except (OSError, ValueError) as error:
-            raise self._error("record", error, "a cyber record") from error
-        self._data = memoryview(self._map)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._data.release()
-        # an error's traceback may still hold a piece
-        with contextlib.suppress(BufferError):
-            self._map.close()
 
     def _error(self, field: str, found: object, expected: str) -> InputError:
         return InputError(f"{self.path}: {field}: {found}: expected {expected}")
@@ -130,7 +114,12 @@ class Record:
           show: called with the bytes of each section that has been read.
         """
         try:
-            for kind, section in self._sections():
+            with self.path.open("rb") as handle:
+                whole = mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ)
+        except (OSError, ValueError) as error:
+            raise self._error("record", error, "a cyber record") from error
+        try:
+            for kind, section in self._sections(memoryview(whole)):
                 if kind == CHANNEL:
                     check_size("descriptors", section)
                     channel = read_channel(bytes(section))
@@ -146,14 +135,26 @@ class Record:
                 f"{self.path}: {error}: expected a cyber record"
             ) from error
 
-    def _sections(self) -> Iterator[tuple[int, memoryview]]:
-        at, end = 0, len(self._data)
+    def _sections(self, data: memoryview) -> Iterator[tuple[int, memoryview]]:
+        """(type, content) of the sections behind the header, up to the index."""
+        at, end = 0, len(data)
         while at < end:
             kind, size = -1, HEAD.size
             if size <= end - at:
-                kind, size = HEAD.unpack_from(self._data, at)
+                kind, size = HEAD.unpack_from(data, at)
                 if at == 0:
-                    self._read_header(kind, size)
+                    is_whole = HEAD.size + HEADER_BYTES <= end
+                    if kind != HEADER or not 0 <= size <= HEADER_BYTES or not is_whole:
+                        found = f"type {kind}, {size} bytes"
+                        raise self._error("header", found, "that of a cyber record")
+                    header = read_header(bytes(data[HEAD.size : HEAD.size + size]))
+                    if header.compress != 0:
+                        expected = (
+                            "0, none (no Apollo release writes compressed chunks)"
+                        )
+                        where = "header: compress"
+                        raise self._error(where, header.compress, expected)
+                    self.is_complete = header.is_complete
                     at = HEAD.size + HEADER_BYTES
                     continue
                 at += HEAD.size
@@ -167,21 +168,10 @@ class Record:
                 where = f"section at byte {at}: beyond the end at {end}"
                 expected = "expected a whole record; truncated?"
                 raise InputError(f"{self.path}: {where}: {expected}")
-            yield kind, self._data[at : at + size]
+            yield kind, data[at : at + size]
             at += size
             if kind == INDEX:  # the last; the rest is of a file written over
                 return
-
-    def _read_header(self, kind: int, size: int) -> None:
-        whole = HEAD.size + HEADER_BYTES <= len(self._data)
-        if kind != HEADER or not 0 <= size <= HEADER_BYTES or not whole:
-            found = f"type {kind}, {size} bytes"
-            raise self._error("header", found, "that of a cyber record")
-        header = read_header(bytes(self._data[HEAD.size : HEAD.size + size]))
-        if header.compress != 0:
-            expected = "0, none (no Apollo release writes compressed chunks)"
-            raise self._error("header: compress", header.compress, expected)
-        self.is_complete = header.is_complete
 
 
 def check_size(what: str, content: memoryview) -> None:

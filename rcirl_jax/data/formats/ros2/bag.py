@@ -134,158 +134,138 @@ def _unpacked(file: Path) -> Path:
 # ------------------------------------------------------------------- storages
 
 
+class BagFile(NamedTuple):
+    """A file of either storage, nothing decoded."""
+
+    topics: dict[str, Topic]  # by name
+    # ns, when the first and the last message were recorded; None: not known
+    span: tuple[int, int] | None
+    # topics wanted -> (topic, ns, bytes) in the order of recording
+    messages: Callable[[Collection[str]], Iterator[tuple[str, int, bytes]]]
+
+
 @contextlib.contextmanager
-def open_file(path: Path) -> Iterator["McapFile | SqliteFile"]:
+def open_file(path: Path) -> Iterator[BagFile]:
     """Opens a file of either storage, by its ending."""
     if path.suffix == ".db3":
         with Database(path) as database:
-            yield SqliteFile(database)
+            yield _of_sqlite(database)
     else:
         with path.open("rb") as stream:
-            yield McapFile(path, stream)
+            yield _of_mcap(path, stream)
 
 
-class McapFile:
-    """Topics and messages of an MCAP file, nothing decoded."""
-
-    def __init__(self, path: Path, stream: BinaryIO) -> None:
-        self.path = path
-        head = stream.read(len(MAGIC))
-        if head != MAGIC:
+def _of_mcap(path: Path, stream: BinaryIO) -> BagFile:
+    head = stream.read(len(MAGIC))
+    if head != MAGIC:
+        raise InputError(
+            f"{path}: begins with {head!r}: expected an MCAP file ({MAGIC!r})"
+        )
+    size = stream.seek(0, io.SEEK_END)
+    stream.seek(max(size - len(MAGIC), 0))
+    if size < 2 * len(MAGIC) or stream.read() != MAGIC:
+        raise InputError(
+            f"{path}: no end after {size} bytes: expected a whole MCAP file; "
+            "truncated, or never closed? `mcap recover FILE -o NEW` keeps what is "
+            "sound"
+        )
+    stream.seek(0)
+    with _damaged(str(path), SOUND):
+        reader = extra_module("mcap.reader", EXTRA).SeekingReader(
+            stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES
+        )
+        summary = reader.get_summary()
+    for chunk in summary.chunk_indexes if summary else ():
+        size = max(chunk.uncompressed_size, chunk.compressed_size)
+        if size > MAX_CHUNK_BYTES:
             raise InputError(
-                f"{path}: begins with {head!r}: expected an MCAP file ({MAGIC!r})"
+                f"{path}: chunk at byte {chunk.chunk_start_offset}: {size} "
+                f"bytes: expected at most {MAX_CHUNK_BYTES}"
             )
-        size = stream.seek(0, io.SEEK_END)
-        stream.seek(max(size - len(MAGIC), 0))
-        if size < 2 * len(MAGIC) or stream.read() != MAGIC:
-            raise InputError(
-                f"{path}: no end after {size} bytes: expected a whole MCAP file; "
-                "truncated, or never closed? `mcap recover FILE -o NEW` keeps what is "
-                "sound"
-            )
-        stream.seek(0)
-        with _damaged(str(path), SOUND):
-            self._reader = extra_module("mcap.reader", EXTRA).SeekingReader(
-                stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES
-            )
-            self._summary = self._reader.get_summary()
-        for chunk in self._summary.chunk_indexes if self._summary else ():
-            size = max(chunk.uncompressed_size, chunk.compressed_size)
-            if size > MAX_CHUNK_BYTES:
-                raise InputError(
-                    f"{path}: chunk at byte {chunk.chunk_start_offset}: {size} "
-                    f"bytes: expected at most {MAX_CHUNK_BYTES}"
-                )
+    if summary is None or not summary.channels:
+        raise InputError(
+            f"{path}: summary: no channels: expected a file with a summary section; "
+            "`mcap recover FILE -o NEW` writes one"
+        )
+    known = summary.statistics
+    counts = known and known.channel_message_counts
+    topics: dict[str, Topic] = {}
+    for key, channel in summary.channels.items():
+        schema = summary.schemas.get(channel.schema_id)
+        topic = Topic(
+            type=schema.name if schema else "",
+            encoding=channel.message_encoding,
+            schema_encoding=schema.encoding if schema else "",
+            schema=schema.data if schema else b"",
+            messages=counts.get(key, 0) if counts else None,
+        )
+        # several publishers are several channels, of which some may be silent
+        if topic.messages != 0 or channel.topic not in topics:
+            topics[channel.topic] = topic
 
-    def topics(self) -> dict[str, Topic]:
-        """Returns the topics by name.
-
-        Raises:
-          InputError: the file has no summary of them.
-        """
-        summary = self._summary
-        if summary is None or not summary.channels:
-            raise InputError(
-                f"{self.path}: summary: no channels: expected a file with a summary "
-                "section; `mcap recover FILE -o NEW` writes one"
-            )
-        counts = summary.statistics and summary.statistics.channel_message_counts
-        found: dict[str, Topic] = {}
-        for key, channel in summary.channels.items():
-            schema = summary.schemas.get(channel.schema_id)
-            topic = Topic(
-                type=schema.name if schema else "",
-                encoding=channel.message_encoding,
-                schema_encoding=schema.encoding if schema else "",
-                schema=schema.data if schema else b"",
-                messages=counts.get(key, 0) if counts else None,
-            )
-            # several publishers are several channels, of which some may be silent
-            if topic.messages != 0 or channel.topic not in found:
-                found[channel.topic] = topic
-        return found
-
-    def span(self) -> tuple[int, int] | None:
-        """Returns when the first and last message were recorded, ns; None: unknown."""
-        counted = self._summary and self._summary.statistics
-        return counted and (counted.message_start_time, counted.message_end_time)
-
-    def messages(self, wanted: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
-        """Yields (topic, ns of recording, bytes) in the order of recording."""
-        found = self._reader.iter_messages(topics=list(wanted))
+    def messages(wanted: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+        found = reader.iter_messages(topics=list(wanted))
         while True:
-            with _damaged(str(self.path), SOUND):
+            with _damaged(str(path), SOUND):
                 item = next(found, None)
             if item is None:
                 return
             yield item[1].topic, item[2].log_time, item[2].data
 
+    span = (known.message_start_time, known.message_end_time) if known else None
+    return BagFile(topics, span, messages)
 
-class SqliteFile:
-    """Topics and messages of a file of rosbag2's SQLite storage, nothing decoded."""
 
-    def __init__(self, database: Database) -> None:
-        self.path, self._database = database.path, database
-        database.need("topics", TOPICS)
-        database.need("messages", MESSAGES)
+def _of_sqlite(database: Database) -> BagFile:
+    database.need("messages", MESSAGES)
 
-    def topics(self) -> dict[str, Topic]:
-        """Returns the topics by name."""
-        definitions = {}
-        if self._database.columns("message_definitions"):
-            rows = self._texts("message_definitions", DEFINITIONS)
-            definitions = {kind: (encoding, text) for kind, encoding, text in rows}
-        sql = "SELECT DISTINCT topic_id FROM messages"
-        met = self._database.chunks(sql, ("messages.topic_id",), MAX_TOPICS)
-        used = {row[0] for rows in met for row in rows}
-        found = {}
-        for key, name, kind, encoding in self._texts("topics", TOPICS):
-            how, text = definitions.get(kind, ("", ""))
-            count = None if key in used else 0
-            found[name] = Topic(kind, encoding, how, text.encode(), count)
-        return found
-
-    def _texts(self, table: str, columns: tuple[str, ...]) -> list[tuple]:
+    def texts(table: str, columns: tuple[str, ...]) -> list[tuple]:
         """Rows of a table of texts, but for the column id."""
-        rows = self._database.table(table, columns, MAX_TOPICS)
+        rows = database.table(table, columns, MAX_TOPICS)
         for row in rows:
             for name, cell in zip(columns, row, strict=True):
                 if name != "id" and not isinstance(cell, str):
-                    where = f"{table}.{name}"
-                    raise self._database.error(where, repr(cell)[:40], "a text")
+                    raise database.error(f"{table}.{name}", repr(cell)[:40], "a text")
         return rows
 
-    def span(self) -> tuple[int, int] | None:
-        """Returns when the first and last message were recorded, ns; None: unknown."""
-        ends = []
-        for way in ("ASC", "DESC"):
-            sql = f"SELECT timestamp FROM messages ORDER BY timestamp {way} LIMIT 1"
-            found = self._database.chunks(sql, ("messages.timestamp",), 1)
-            ends += [row[0] for rows in found for row in rows]
-        if len(ends) != 2 or not all(isinstance(end, int) for end in ends):
-            return None
-        return ends[0], ends[1]
+    named = texts("topics", TOPICS)
+    has_definitions = database.columns("message_definitions")
+    rows = texts("message_definitions", DEFINITIONS) if has_definitions else ()
+    definitions = {kind: (encoding, text) for kind, encoding, text in rows}
+    sql = "SELECT DISTINCT topic_id FROM messages"
+    met = database.chunks(sql, ("messages.topic_id",), MAX_TOPICS)
+    used = {row[0] for rows in met for row in rows}
+    topics = {}
+    for key, name, kind, encoding in named:
+        how, text = definitions.get(kind, ("", ""))
+        count = None if key in used else 0
+        topics[name] = Topic(kind, encoding, how, text.encode(), count)
+    ends = []
+    for way in ("ASC", "DESC"):
+        sql = f"SELECT timestamp FROM messages ORDER BY timestamp {way} LIMIT 1"
+        found = database.chunks(sql, ("messages.timestamp",), 1)
+        ends += [row[0] for rows in found for row in rows if isinstance(row[0], int)]
 
-    def messages(self, wanted: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
-        """Yields (topic, ns of recording, bytes) in the order of recording."""
-        names = {row[0]: row[1] for row in self._texts("topics", TOPICS)}
-        keys = tuple(key for key, name in names.items() if name in wanted)
+    def messages(wanted: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+        names = {key: name for key, name, *_ in named if name in wanted}
         sql = (
             "SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN "
-            f"({', '.join('?' * len(keys))}) ORDER BY timestamp"
+            f"({', '.join('?' * len(names))}) ORDER BY timestamp"
         )
         numbers = dict.fromkeys(wanted, 0)
-        for rows in self._database.chunks(sql, MESSAGES, MAX_MESSAGES, keys):
+        for rows in database.chunks(sql, MESSAGES, MAX_MESSAGES, tuple(names)):
             for key, logged, data in rows:
                 name = names[key]
                 if not isinstance(logged, int) or not isinstance(data, bytes):
                     raise InputError(
-                        f"{self.path}: messages: message {numbers[name]} of {name}: "
-                        f"{type(logged).__name__}, {type(data).__name__}: expected "
-                        "a time in ns and bytes"
+                        f"{database.path}: messages: message {numbers[name]} of "
+                        f"{name}: {type(logged).__name__}, {type(data).__name__}: "
+                        "expected a time in ns and bytes"
                     )
                 numbers[name] += 1
                 yield name, logged, data
+
+    return BagFile(topics, (ends[0], ends[1]) if len(ends) == 2 else None, messages)
 
 
 # ------------------------------------------------------------------- decoding

@@ -120,7 +120,7 @@ def _roles(files: list[Path], spec: dict) -> tuple[dict[str, str], list[str]]:
     known: dict[str, Topic] = {}
     for file in files:
         with open_file(file) as opened:
-            for name, topic in opened.topics().items():
+            for name, topic in opened.topics.items():
                 if topic.messages != 0:
                     known.setdefault(name, topic)
     roles, notes = {}, []
@@ -180,7 +180,7 @@ def _read_file(
         return Rows(tables=tables, progress=progress)
 
     with open_file(path) as opened:
-        own, span = opened.topics(), opened.span()
+        own, span = opened.topics, opened.span
         for name, logged, data in opened.messages([n for n in roles if n in own]):
             began = logged if began is None else began
             if abs(logged - began) > PIECE_S * 1e9:
