@@ -5,8 +5,6 @@ use: reading single rows at random would unpack a block of 256 for each, so ever
 is unpacked once, and its rows wait in memory for their turn.
 """
 
-import concurrent.futures
-import dataclasses
 import functools
 import math
 import queue
@@ -26,7 +24,6 @@ from rcirl_jax.types import Demonstration
 # blocks over which rows are mixed; it decides the order, so it is no setting.
 # Half of them are in memory at a time: 32,768 rows, 340 MB.
 WINDOW_BLOCKS = 256
-PLAN_AHEAD = 0.1  # share of an epoch before whose end the next one is planned
 READ_ROWS = 4096  # rows read at a time at most, so that reading needs little memory
 ROW_BYTES = sum(math.prod(x.shape) * x.dtype.itemsize for x in leaf_specs().values())
 
@@ -118,14 +115,6 @@ class RowStream:
         )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Epoch:
-    """The plan of an epoch: its order, and what reads it from disk."""
-
-    order: np.ndarray  # [n] which of the chosen rows are visited
-    stream: RowStream | None  # from the position on that it was planned for
-
-
 def split_batches(
     dataset: Demonstrations,
     split: str,
@@ -208,31 +197,29 @@ class BatchIterator:
             blocks = rows.blocks(self._chosen) if stored else alone
         self._blocks = np.unique(blocks, return_inverse=True)[1].astype(np.int32)
         self._numbers = self._chosen if numbers is None else numbers
-        for name, value, is_good, expected in (
-            ("rows", self._chosen.size, self._chosen.size > 0, "at least one scene"),
+        multiple = batch_size >= 1 and num_shards >= 1 and batch_size % num_shards == 0
+        for is_good, what, expected in (
+            (self._chosen.size > 0, "rows: 0", "at least one scene"),
             (
-                "batch_size",
-                batch_size,
-                batch_size >= 1 and num_shards >= 1 and batch_size % num_shards == 0,
+                multiple,
+                f"batch_size: {batch_size}",
                 f"a positive multiple of the number of processes, {num_shards}",
             ),
             (
-                "shard_index",
-                shard_index,
                 0 <= shard_index < num_shards,
+                f"shard_index: {shard_index}",
                 f"0 to {num_shards - 1}",
             ),
-            ("seed", seed, seed >= 0, ">= 0"),
+            (seed >= 0, f"seed: {seed}", ">= 0"),
         ):
             if not is_good:
-                raise InputError(f"batches: {name}: {value}: expected {expected}")
+                raise InputError(f"batches: {what}: expected {expected}")
         self._batch_size, self._seed = batch_size, seed
         local = batch_size // num_shards
         self._part = np.arange(shard_index * local, (shard_index + 1) * local)
         self._epoch = self._position = 0
-        self._plan: _Epoch | None = None
-        self._planner = concurrent.futures.ThreadPoolExecutor(1)
-        self._later: concurrent.futures.Future[_Epoch] | None = None
+        self._order: np.ndarray | None = None  # of the epoch's rows, once planned
+        self._stream: RowStream | None = None  # that reads them from disk
 
     @property
     def batches_per_epoch(self) -> int:
@@ -267,44 +254,37 @@ class BatchIterator:
                 f"{self.batches_per_epoch}: same dataset and batch size"
             )
         self._epoch, self._position = int(state["epoch"]), int(state["position"])
-        self._plan = self._later = None
+        self._order = None
 
     def __iter__(self) -> "BatchIterator":
         return self
 
     def __next__(self) -> tuple[Demonstration, np.ndarray, np.ndarray]:
-        plan = self._plan or self._planned(self._epoch, self._position)
-        self._plan, count = plan, self._chosen.size
-        places = self._position * self._batch_size + self._part
-        visited = plan.order[places % count]
+        count, size = self._chosen.size, self._batch_size
+        if self._order is None:
+            self._order = epoch_order(self._seed, self._epoch, self._blocks)
+            if not isinstance(self._rows, Demonstration):
+                rest = np.arange(self._position, self.batches_per_epoch)
+                places = (rest[:, None] * size + self._part).reshape(-1)
+                ahead = self._order[places % count]
+                self._stream = RowStream(
+                    self._rows,
+                    self._chosen[ahead],
+                    self._blocks[ahead],
+                    self._part.size,
+                )
+        places = self._position * size + self._part
+        visited = self._order[places % count]
         if isinstance(self._rows, Demonstration):
             rows = self._chosen[visited]
             batch = jax.tree.map(lambda leaf: leaf[rows], self._rows)
         else:
-            assert plan.stream is not None
-            batch = next(plan.stream)
+            assert self._stream is not None
+            batch = next(self._stream)
         self._position += 1
         if self._position == self.batches_per_epoch:
-            self._epoch, self._position = self._epoch + 1, 0
-            self._plan = self._later.result() if self._later else None
-            self._later = None
-        elif self._later is None and (
-            self._position >= (1.0 - PLAN_AHEAD) * self.batches_per_epoch
-        ):  # the step need not wait for the plan of the next epoch
-            self._later = self._planner.submit(self._planned, self._epoch + 1, 0)
+            self._epoch, self._position, self._order = self._epoch + 1, 0, None
         return batch, (places < count).astype(np.float32), self._numbers[visited]
-
-    def _planned(self, epoch: int, position: int) -> _Epoch:
-        """Plan an epoch, to be read from a position on."""
-        order, stream = epoch_order(self._seed, epoch, self._blocks), None
-        if not isinstance(self._rows, Demonstration):
-            batches = np.arange(position, self.batches_per_epoch)
-            places = batches[:, None] * self._batch_size + self._part
-            ahead = order[places.reshape(-1) % self._chosen.size]
-            stream = RowStream(
-                self._rows, self._chosen[ahead], self._blocks[ahead], self._part.size
-            )
-        return _Epoch(order=order, stream=stream)
 
 
 class Prefetch(Generic[T]):
