@@ -167,89 +167,59 @@ def _simulated(
         batch = jobs[start:end]
         logs = simulate([run for _, run in batch], drivers)
         for (name, run), log in zip(batch, logs, strict=True):
-            yield to_recording(name, run, log, settings)
+            yield _recording(name, run, log, settings)
         start = end
 
 
-def to_recording(name: str, run: RunConfig, log: Log, settings: dict) -> Recording:
-    """A simulated log as a Recording.
-
-    Args:
-      name: of the recording; also its group.
-      run: what was simulated.
-      log: the samples.
-      settings: `source`, `licence` and `position_noise_m` are used.
-    """
+def _recording(name: str, run: RunConfig, log: Log, settings: dict) -> Recording:
+    """Return a simulated log as a Recording; `name` is also its group."""
+    road, noise = log.road, float(settings["position_noise_m"])
     rng = np.random.default_rng((*run.seed[:-1], POSITION_STREAM))
     seen = log.vehicle >= 0
-    seen &= (log.s > SEEN_FROM_M) & (log.s < log.road.length - SEEN_UNTIL_M)
-    numbers = np.unique(log.vehicle[seen])
-    noise = float(settings["position_noise_m"])
+    seen &= (log.s > SEEN_FROM_M) & (log.s < road.length - SEEN_UNTIL_M)
     tracks = []
-    for number in numbers:
+    for number in np.unique(log.vehicle[seen]).tolist():
         times, slots = np.nonzero(seen & (log.vehicle == number))
-        if times.size >= MIN_TRACK_S * run.rate_hz:
-            tracks.append(_track(int(number), times, slots, log, run, rng, noise))
+        if times.size < MIN_TRACK_S * run.rate_hz:
+            continue
+        driver = log.drivers[number]
+        s, l, slope, v = (x[times, slots] for x in (log.s, log.l, log.slope, log.v))
+        x, y, heading = to_world(road, s, l, slope)
+        shift = noise * rng.standard_normal((2, times.size))
+        # where the car stands, or wants to stand, on the strip
+        station, destination = float(driver["destination"]), None
+        if math.isfinite(station):
+            strip = road.offset(road.num_lanes)
+            place = to_world(road, np.array(station), strip, np.array(0.0))
+            destination = float(place[0]), float(place[1])
+        track = Track(
+            id=f"v{number:04d}",
+            kind=Kind.VEHICLE,
+            length=float(driver["length"]),
+            width=float(driver["width"]),
+            t=times / run.rate_hz,
+            x=x + shift[0],
+            y=y + shift[1],
+            heading=heading,
+            speed=v,
+            destination=destination,
+        )
+        tracks.append(track)
+    signals = []
+    for index, stop in enumerate(road.stops):
+        if not stop.is_sign:
+            offset = float(log.signal_offset[index])
+            start, state = schedule(road.cycle, offset, run.duration_s)
+            signals.append(Signal(id=f"signal-{index}", start=start, state=state))
     return Recording(
         name=name,
         source=settings["source"],
         licence=settings["licence"],
         rate_hz=run.rate_hz,
         tracks=tuple(tracks),
-        lanes=lanes(log.road),
-        signals=_signals(log, run),
+        lanes=lanes(road),
+        signals=tuple(signals),
         group=name,
-        default_speed_limit=float(log.road.limit[0]),
+        default_speed_limit=float(road.limit[0]),
         notes=(f"simulated: {run.road}, seed {run.seed}",),
     )
-
-
-def _track(
-    number: int,
-    times: np.ndarray,
-    slots: np.ndarray,
-    log: Log,
-    run: RunConfig,
-    rng: np.random.Generator,
-    noise: float,
-) -> Track:
-    driver = log.drivers[number]
-    s, l, slope, v = (
-        values[times, slots] for values in (log.s, log.l, log.slope, log.v)
-    )
-    x, y, heading = to_world(log.road, s, l, slope)
-    shift = noise * rng.standard_normal((2, times.size))
-    return Track(
-        id=f"v{number:04d}",
-        kind=Kind.VEHICLE,
-        length=float(driver["length"]),
-        width=float(driver["width"]),
-        t=times / run.rate_hz,
-        x=x + shift[0],
-        y=y + shift[1],
-        heading=heading,
-        speed=v,
-        destination=_destination(driver, log),
-    )
-
-
-def _destination(driver: np.void, log: Log) -> tuple[float, float] | None:
-    """Return where the car stands, or wants to stand, on the strip."""
-    station = float(driver["destination"])
-    if not math.isfinite(station):
-        return None
-    road = log.road
-    offset = road.offset(road.num_lanes)
-    x, y, _ = to_world(road, np.array(station), offset, np.array(0.0))
-    return float(x), float(y)
-
-
-def _signals(log: Log, run: RunConfig) -> tuple[Signal, ...]:
-    signals = []
-    for index, stop in enumerate(log.road.stops):
-        if not stop.is_sign:
-            start, state = schedule(
-                log.road.cycle, float(log.signal_offset[index]), run.duration_s
-            )
-            signals.append(Signal(id=f"signal-{index}", start=start, state=state))
-    return tuple(signals)

@@ -127,49 +127,43 @@ def lanes(road: Road) -> tuple[Lane, ...]:
     Piece p of lane k is named "k.p"; the strip is lane `num_lanes`. A stop line
     belongs to the piece that ends at it and is governed by signal "signal-i".
     """
-    cuts = _cuts(road)
-    pieces = []
-    for k in range(road.num_lanes + 1):
-        for p, (start, end) in enumerate(itertools.pairwise(cuts)):
-            pieces.append(_piece(road, k, p, start, end, last=end == cuts[-1]))
-    return tuple(pieces)
-
-
-def _cuts(road: Road) -> list[float]:
     changes = np.flatnonzero(np.diff(road.limit)) * GRID_M
     inner = {float(s) for s in changes} | {stop.station for stop in road.stops}
-    return [0.0, *sorted(inner), road.length]
-
-
-def _piece(road: Road, k: int, p: int, start: float, end: float, last: bool) -> Lane:
-    count = max(int(np.ceil((end - start) / CENTRE_STEP_M)), 1) + 1
-    s = np.linspace(start, end, count)
-    x, y, _ = to_world(road, s, np.full(count, road.offset(k)), np.zeros(count))
-    stop = next(((i, q) for i, q in enumerate(road.stops) if q.station == end), None)
-    on_road = k < road.num_lanes
-    half = np.full(count, 0.5 * road.lane_width)
-    middle = int(0.5 * (start + end) / GRID_M)
-    return Lane(
-        id=f"{k}.{p}",
-        centre=np.stack([x, y], axis=1),
-        left_width=half,
-        right_width=half.copy(),
-        speed_limit=float(road.limit[middle]),
-        successors=() if last else (f"{k}.{p + 1}",),
-        left=f"{k - 1}.{p}" if k > 0 else None,
-        right=f"{k + 1}.{p}" if on_road else None,
-        stop_line=_stop_line(road, k, end) if stop and on_road else None,
-        signal_ids=(
-            (f"signal-{stop[0]}",) if stop and on_road and not stop[1].is_sign else ()
-        ),
-        stop_sign=bool(stop and on_road and stop[1].is_sign),
-    )
-
-
-def _stop_line(road: Road, k: int, station: float) -> np.ndarray:
-    edges = road.offset(k) + np.array([0.5, -0.5]) * road.lane_width
-    x, y, _ = to_world(road, np.full(2, station), edges, np.zeros(2))
-    return np.stack([x, y], axis=1)
+    cuts = [0.0, *sorted(inner), road.length]
+    number_at = {stop.station: i for i, stop in enumerate(road.stops)}
+    edges = np.array([0.5, -0.5]) * road.lane_width
+    made = []
+    for k in range(road.num_lanes + 1):
+        on_road = k < road.num_lanes
+        for p, (start, end) in enumerate(itertools.pairwise(cuts)):
+            count = max(int(np.ceil((end - start) / CENTRE_STEP_M)), 1) + 1
+            s = np.linspace(start, end, count)
+            x, y, _ = to_world(road, s, np.full(count, road.offset(k)), 0.0 * s)
+            half = np.full(count, 0.5 * road.lane_width)
+            line, signs = None, False
+            signals: tuple[str, ...] = ()
+            if on_road and end in number_at:
+                i = number_at[end]
+                ends = to_world(
+                    road, np.full(2, end), road.offset(k) + edges, np.zeros(2)
+                )
+                line, signs = np.stack(ends[:2], axis=1), road.stops[i].is_sign
+                signals = () if signs else (f"signal-{i}",)
+            piece = Lane(
+                id=f"{k}.{p}",
+                centre=np.stack([x, y], axis=1),
+                left_width=half,
+                right_width=half.copy(),
+                speed_limit=float(road.limit[int(0.5 * (start + end) / GRID_M)]),
+                successors=() if end == cuts[-1] else (f"{k}.{p + 1}",),
+                left=f"{k - 1}.{p}" if k > 0 else None,
+                right=f"{k + 1}.{p}" if on_road else None,
+                stop_line=line,
+                signal_ids=signals,
+                stop_sign=signs,
+            )
+            made.append(piece)
+    return tuple(made)
 
 
 Knots = list[tuple[float, float]]

@@ -26,7 +26,7 @@ for the driver e, new follower n and old follower o; primes: after the change.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 import numpy as np
@@ -205,24 +205,9 @@ def sample_drivers(
     stops = (rng.random(count) < config.destination_share) & ~truck
     places = rng.choice(road.parking(), count)
     drivers["destination"] = np.where(stops, places, np.inf)
-    _add_drift(rng, config, road, drivers)
-    return drivers
-
-
-def _normal(rng: np.random.Generator, spread: Spread, count: int) -> np.ndarray:
-    mean, sd, low, high = spread
-    return np.clip(rng.normal(mean, sd, count), low, high)
-
-
-def _add_drift(
-    rng: np.random.Generator, config: DriverConfig, road: Road, drivers: np.ndarray
-) -> None:
-    """Drift l(s) = A sum_i sin(w_i s + p_i); variance 3 A^2 / 2 = drift_m^2.
-
-    It runs with the distance, so that a standing car does not slide. Wide
-    vehicles drift less: their peak 3 A leaves room for the neighbour.
-    """
-    count = drivers.size
+    # drift l(s) = A sum_i sin(w_i s + p_i) of variance 3 A^2 / 2 = drift_m^2. It runs
+    # with the distance, so that a standing car does not slide. Wide vehicles drift
+    # less: their peak 3 A leaves room for the neighbour
     periods = rng.uniform(*config.drift_period_s, (count, NUM_WAVES))
     drivers["drift_wave"] = 2.0 * np.pi / (periods * float(road.limit.max()))
     drivers["drift_phase"] = rng.uniform(0.0, 2.0 * np.pi, (count, NUM_WAVES))
@@ -230,6 +215,12 @@ def _add_drift(
     room = 0.5 * (road.lane_width - drivers["width"] - SIDE_CLEARANCE_M)
     least = min(amplitude, 0.1 / NUM_WAVES)
     drivers["drift"] = np.clip(room / NUM_WAVES, least, amplitude)
+    return drivers
+
+
+def _normal(rng: np.random.Generator, spread: Spread, count: int) -> np.ndarray:
+    mean, sd, low, high = spread
+    return np.clip(rng.normal(mean, sd, count), low, high)
 
 
 def idm_acceleration(
@@ -322,63 +313,45 @@ def quintic(phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 # ----------------------------------------------------------------------- state
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class RoadTable:
-    """Roads of all recordings, padded to equal sizes."""
+    """Roads of all recordings, padded to equal sizes; arrays keep their last value."""
 
-    limit: np.ndarray  # [R, G] m/s, envelope of the limit
-    curve: np.ndarray  # [R, G] m/s, envelope of the curve speed
-    kappa: np.ndarray  # [R, G] 1/m
-    calm: np.ndarray  # [R, G] bool, lane changes may start here
-    num_lanes: np.ndarray  # [R, 1]
-    lane_width: np.ndarray  # [R, 1] m
-    length: np.ndarray  # [R, 1] m
-    stop_s: np.ndarray  # [R, S + 1] m, inf after the last
-    stop_is_sign: np.ndarray  # [R, S + 1] bool
-    green: np.ndarray  # [R, 1] s
-    yellow: np.ndarray  # [R, 1] s
-    cycle: np.ndarray  # [R, 1] s
+    def __init__(self, roads: Sequence[Road]) -> None:
+        size = max(road.x.size for road in roads)
+
+        def stack(rows: Iterable[np.ndarray]) -> np.ndarray:
+            return np.array([np.pad(x, (0, size - x.size), mode="edge") for x in rows])
+
+        def column(values: Iterable[float]) -> np.ndarray:
+            return np.array(list(values))[:, None]
+
+        # [R, G] m/s, envelopes of the limit and of the speed in curves
+        self.limit = stack(road.limit_envelope() for road in roads)
+        self.curve = stack(road.curve_envelope() for road in roads)
+        self.kappa = stack(road.kappa for road in roads)  # [R, G] 1/m
+        self.calm = stack(map(_calm, roads))  # [R, G] bool, lane changes may start here
+        self.num_lanes = column(road.num_lanes for road in roads)  # [R, 1]
+        self.lane_width = column(road.lane_width for road in roads)  # [R, 1] m
+        self.length = column(road.length for road in roads)  # [R, 1] m
+        self.green = column(road.cycle[0] for road in roads)  # [R, 1] s
+        self.yellow = column(road.cycle[1] for road in roads)  # [R, 1] s
+        self.cycle = column(sum(road.cycle) for road in roads)  # [R, 1] s
+        lines = max(len(road.stops) for road in roads) + 1
+        self.stop_s = np.full((len(roads), lines), np.inf)  # m, inf after the last
+        self.stop_is_sign = np.zeros((len(roads), lines), bool)
+        for r, road in enumerate(roads):
+            for i, stop in enumerate(road.stops):
+                self.stop_s[r, i] = stop.station
+                self.stop_is_sign[r, i] = stop.is_sign
 
     def index(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Grid index of stations [R, N] m, for use on [R, G] tables."""
+        """Return the grid index of stations [R, N] m, for use on [R, G] tables."""
         rows = np.arange(s.shape[0])[:, None]
         return rows, np.clip((s / GRID_M).astype(int), 0, self.limit.shape[1] - 1)
 
     def offset(self, lane: np.ndarray) -> np.ndarray:
-        """Lateral offset [R, N] m of lane centres."""
+        """Return the lateral offset [R, N] m of lane centres."""
         return (0.5 * (self.num_lanes - 1) - lane) * self.lane_width
-
-
-def road_table(roads: list[Road]) -> RoadTable:
-    """Stack roads; arrays are continued by their last value."""
-    size = max(road.x.size for road in roads)
-    lines = max(len(road.stops) for road in roads) + 1
-    stop_s = np.full((len(roads), lines), np.inf)
-    is_sign = np.zeros((len(roads), lines), bool)
-    for r, road in enumerate(roads):
-        for i, stop in enumerate(road.stops):
-            stop_s[r, i], is_sign[r, i] = stop.station, stop.is_sign
-
-    def stack(rows: list[np.ndarray]) -> np.ndarray:
-        return np.array([np.pad(x, (0, size - x.size), mode="edge") for x in rows])
-
-    def column(values: list[float]) -> np.ndarray:
-        return np.array(values)[:, None]
-
-    return RoadTable(
-        limit=stack([road.limit_envelope() for road in roads]),
-        curve=stack([road.curve_envelope() for road in roads]),
-        kappa=stack([road.kappa for road in roads]),
-        calm=stack([_calm(road) for road in roads]),
-        num_lanes=column([road.num_lanes for road in roads]),
-        lane_width=column([road.lane_width for road in roads]),
-        length=column([road.length for road in roads]),
-        stop_s=stop_s,
-        stop_is_sign=is_sign,
-        green=column([road.cycle[0] for road in roads]),
-        yellow=column([road.cycle[1] for road in roads]),
-        cycle=column([sum(road.cycle) for road in roads]),
-    )
 
 
 def _calm(road: Road) -> np.ndarray:
@@ -770,7 +743,7 @@ class Traffic:
         self.dt = 1.0 / (runs[0].rate_hz * self.substeps)
         self.clock = -runs[0].warmup_s
         self.roads = [ROADS[run.road]() for run in runs]
-        self.table = road_table(self.roads)
+        self.table = RoadTable(self.roads)
         self.sources = [
             _Source(run, config, road)
             for run, road in zip(runs, self.roads, strict=True)
