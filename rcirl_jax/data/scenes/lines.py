@@ -1,6 +1,5 @@
 """Stop lines, signals and destinations as obstacles of a scene."""
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -75,45 +74,37 @@ def trusted_signals(
     return trusted, notes
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Fronts:
-    """The middle of every car's front bumper, all samples track after track."""
+def _fronts(tracks: Sequence[Track]) -> tuple[np.ndarray, ...]:
+    """Return the middle of every car's front bumper, all samples track after track.
 
-    x: np.ndarray  # [n] m
-    y: np.ndarray  # [n] m
-    t: np.ndarray  # [n] s
-    owner: np.ndarray  # [n] number of the track
+    Four arrays [n]: x m, y m, t s and the number of the track.
+    """
 
-
-def _fronts(tracks: Sequence[Track]) -> _Fronts:
     def join(name: str) -> np.ndarray:
         return np.concatenate([np.zeros(0)] + [getattr(one, name) for one in tracks])
 
     sizes, heading = [track.t.size for track in tracks], join("heading")
     half = np.repeat([0.5 * track.length for track in tracks], sizes)
-    return _Fronts(
-        x=join("x") + half * np.cos(heading),
-        y=join("y") + half * np.sin(heading),
-        t=join("t"),
-        owner=np.repeat(np.arange(len(tracks)), sizes),
-    )
+    owner = np.repeat(np.arange(len(tracks)), sizes)
+    x, y = join("x") + half * np.cos(heading), join("y") + half * np.sin(heading)
+    return x, y, join("t"), owner
 
 
-def _crossings(fronts: _Fronts, line: np.ndarray) -> np.ndarray:
+def _crossings(fronts: tuple[np.ndarray, ...], line: np.ndarray) -> np.ndarray:
     """Return time [s] at which each front that does first crosses the segment [2, 2].
 
     By hand, because shapely first makes a line of every step: 50 times slower.
     """
+    x, y, t, owner = fronts
     (x0, y0), (x1, y1) = line
     dx, dy = x1 - x0, y1 - y0
-    side = (fronts.x - x0) * dy - (fronts.y - y0) * dx
-    along = ((fronts.x - x0) * dx + (fronts.y - y0) * dy) / max(dx * dx + dy * dy, 1e-9)
+    side = (x - x0) * dy - (y - y0) * dx
+    along = ((x - x0) * dx + (y - y0) * dy) / max(dx * dx + dy * dy, 1e-9)
     flips = (np.sign(side[1:]) != np.sign(side[:-1])) & (side[:-1] != 0.0)
-    flips &= (along[1:] > 0.0) & (along[1:] < 1.0)
-    flips &= fronts.owner[1:] == fronts.owner[:-1]
+    flips &= (along[1:] > 0.0) & (along[1:] < 1.0) & (owner[1:] == owner[:-1])
     where = np.flatnonzero(flips)
-    _, first = np.unique(fronts.owner[where], return_index=True)
-    return fronts.t[where[first] + 1]
+    _, first = np.unique(owner[where], return_index=True)
+    return t[where[first] + 1]
 
 
 def line_obstacles(
@@ -152,18 +143,12 @@ def line_obstacles(
         if demand.any():
             rows.append(_line(ahead, demand, Kind.STOP, is_light))
     if track.destination is not None:
-        rows += _destination(frame, track, motion)
+        s, l = project(frame, *np.array(track.destination)[:, None])
+        # the car stands ON its destination: the line lies at its front bumper
+        ahead = float(s[0]) - motion.s0 + 0.5 * (track.length or EGO_LENGTH_M)
+        if abs(l[0]) <= LINE_HALF_WIDTH_M and 0.0 < ahead <= LOOK_AHEAD_M:
+            rows.append(_line(ahead, np.ones(TIMES_S.size, bool), Kind.VIRTUAL))
     return rows[:4]
-
-
-def _destination(frame: LaneFrame, track: Track, motion: Motion) -> list[dict]:
-    x, y = track.destination or (0.0, 0.0)
-    s, l = project(frame, np.array([x]), np.array([y]))
-    # the car stands ON its destination: the line lies at its front bumper
-    ahead = float(s[0]) - motion.s0 + 0.5 * (track.length or EGO_LENGTH_M)
-    if abs(l[0]) > LINE_HALF_WIDTH_M or not 0.0 < ahead <= LOOK_AHEAD_M:
-        return []
-    return [_line(ahead, np.ones(TIMES_S.size, bool), Kind.VIRTUAL)]
 
 
 def _line(
