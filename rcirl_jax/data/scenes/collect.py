@@ -120,16 +120,15 @@ class Collector:
 
     def scenes(self) -> Iterator[dict]:
         """Yield rows of one scene each, as flat dicts of numpy arrays."""
-        rows = self._rows()
+        drivers = (
+            (number, smooth)
+            for number, smooth in enumerate(self.tracks)
+            if smooth.track.kind == Kind.VEHICLE
+        )
+        rows = itertools.chain.from_iterable(self._scenes_of(*one) for one in drivers)
         while some := list(itertools.islice(rows, LABELLED_AT_ONCE)):
             labels.add_labels(some)
             yield from some
-
-    def _rows(self) -> Iterator[dict]:
-        """Yield rows without their labels."""
-        for number, smooth in enumerate(self.tracks):
-            if smooth.track.kind == Kind.VEHICLE:
-                yield from self._scenes_of(number, smooth)
 
     def _scenes_of(self, number: int, smooth: SmoothTrack) -> Iterator[dict]:
         config, rate = self.config, self.rate
@@ -166,14 +165,11 @@ class Collector:
             if isinstance(row, str):
                 self.dropped[row] += 1
             else:
-                self._count_end(row)
+                # times of the recorded future, and those of them without mask
+                times = int(np.sum(row["future_s"] + 1e-6 >= TIMES_S))
+                cut = times - int(np.sum(row["time_valid"]))
+                self.ended.update(shortened=int(cut > 0), times=times, times_cut=cut)
                 yield row
-
-    def _count_end(self, row: dict) -> None:
-        """Count the times of a scene's recorded future, and those without mask."""
-        times = int(np.sum(row["future_s"] + 1e-6 >= TIMES_S))
-        cut = times - int(np.sum(row["time_valid"]))
-        self.ended.update(shortened=int(cut > 0), times=times, times_cut=cut)
 
     def view(self, frame: LaneFrame) -> FrameTracks:
         """All tracks in the chain's frame (cached for the chains last asked for)."""

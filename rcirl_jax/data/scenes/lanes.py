@@ -77,7 +77,8 @@ class LaneGraph:
             owners += [len(points) - 1] * len(dense)
         self._owner = np.array(owners, int)
         self._names = np.array(list(self.lanes), object)
-        self._reach = np.array([self._half_width(n) + 0.5 for n in self.lanes])
+        half = [max(x.left_width.max(), x.right_width.max()) for x in recording.lanes]
+        self._reach = np.array(half, float) + 0.5
         self._heading = np.concatenate(headings) if headings else np.zeros(0)
         self._points = np.concatenate(points) if points else np.zeros((0, 2))
         self._tree = KDTree(self._points) if len(self._points) else None
@@ -112,10 +113,6 @@ class LaneGraph:
         together = on & (apart <= SAME_PLACE_M)
         best = np.argmax(np.where(together, often[owners], -1), axis=1)
         return np.where(found, self._names[owners[rows, best]], "")
-
-    def _half_width(self, lane_id: str) -> float:
-        lane = self.lanes[lane_id]
-        return float(max(lane.left_width.max(), lane.right_width.max()))
 
     def chain(
         self, start: str, visited: Iterable[str] | Mapping[str, int]
@@ -170,11 +167,8 @@ class LaneGraph:
 
     def frame(self, chain: tuple[str, ...]) -> LaneFrame:
         """Return the Frenet frame of a chain (cached)."""
-        if chain not in self._frames:
-            self._frames[chain] = self._build_frame(chain)
-        return self._frames[chain]
-
-    def _build_frame(self, chain: tuple[str, ...]) -> LaneFrame:
+        if chain in self._frames:
+            return self._frames[chain]
         lanes = [self.lanes[name] for name in chain]
         points = np.concatenate([lane.centre for lane in lanes])
         length = float(_arc(points)[-1])
@@ -192,7 +186,7 @@ class LaneGraph:
             for lane in lanes
             if lane.stop_line is not None
         ]
-        return LaneFrame(
+        self._frames[chain] = LaneFrame(
             chain=chain,
             line=line,
             length=length,
@@ -206,6 +200,7 @@ class LaneGraph:
             road_right=-right - np.repeat(extra_right, counts),
             stop_lines=tuple(stops),
         )
+        return self._frames[chain]
 
     def _beside(self, lane: Lane, side: str) -> float:
         """Return width [m] of all same-direction lanes on one side."""
