@@ -13,7 +13,7 @@ from absl import flags
 
 import rcirl_jax
 from rcirl_jax.cli.running import provenance, run
-from rcirl_jax.evaluation.ranking.table import to_json
+from rcirl_jax.evaluation.ranking.report import to_json
 from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.runtime.executors import make_executor
 

@@ -18,7 +18,7 @@ from absl import flags
 from experiments.known_drivers import made_rows, table, tallied, with_faults
 from rcirl_jax.cli import flags as shared
 from rcirl_jax.cli.running import provenance, run
-from rcirl_jax.evaluation.closed_loop.files import runs_of
+from rcirl_jax.evaluation.closed_loop.runs import runs_of
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite
 from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.simulation.suite import catalogue_set, suite_refs

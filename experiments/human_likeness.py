@@ -15,7 +15,6 @@ from absl import flags
 from rcirl_jax.cli.running import provenance, run
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, rank_scenes, report_of
-from rcirl_jax.evaluation.ranking.format import format_table
 from rcirl_jax.evaluation.ranking.learners import (
     LEARNERS,
     learner_configs,
@@ -23,7 +22,7 @@ from rcirl_jax.evaluation.ranking.learners import (
     train_learners,
     untrained,
 )
-from rcirl_jax.evaluation.ranking.table import UNTRAINED_ROW, to_json
+from rcirl_jax.evaluation.ranking.report import UNTRAINED_ROW, format_table, to_json
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
 from rcirl_jax.train.state import POSITIVES, TrainConfig
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
-from rcirl_jax.evaluation.closed_loop.output import text_table
+from rcirl_jax.evaluation.closed_loop.runs import SuiteRuns
+from rcirl_jax.evaluation.closed_loop.summary import text_table
 from rcirl_jax.evaluation.gate import types as gate
 from rcirl_jax.evaluation.gate.checks import MIN_CLUSTERS
 from rcirl_jax.evaluation.gate.verdict import judge, pair_of

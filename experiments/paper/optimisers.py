@@ -15,9 +15,8 @@ import numpy as np
 from experiments.paper.common import HORIZON, base, dataset, picture, seeds, write
 from rcirl_jax.cli.running import run
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
-from rcirl_jax.evaluation.ranking.format import format_table
 from rcirl_jax.evaluation.ranking.learners import scorers, train_learners
-from rcirl_jax.evaluation.ranking.table import to_json
+from rcirl_jax.evaluation.ranking.report import format_table, to_json
 from rcirl_jax.report.charts import curves_panel, interval_panel
 from rcirl_jax.report.style import figure, label, save
 

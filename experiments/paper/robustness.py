@@ -17,9 +17,7 @@ from typing import Any
 
 from absl import flags
 
-from rcirl_jax.cli.running import provenance, run
-from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop.robustness import (
+from experiments.paper.plans import (
     Disturbance,
     Table,
     frames,
@@ -27,6 +25,8 @@ from rcirl_jax.evaluation.closed_loop.robustness import (
     steadiness,
     summary,
 )
+from rcirl_jax.cli.running import provenance, run
+from rcirl_jax.errors import InputError
 from rcirl_jax.export.loading import open_reward, reward_params
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.dp import dp_policy

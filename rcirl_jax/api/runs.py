@@ -16,17 +16,16 @@ from rcirl_jax.data.store.dataset import Dataset, open_dataset
 from rcirl_jax.data.store.joined import Demonstrations, open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.likeness import DRIVES
-from rcirl_jax.evaluation.closed_loop.output import format_suite
 from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteResult,
     write_suite,
 )
+from rcirl_jax.evaluation.closed_loop.summary import format_suite
 from rcirl_jax.evaluation.gate.types import GateConfig, Verdict
 from rcirl_jax.evaluation.gate.verdict import write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
-from rcirl_jax.evaluation.ranking.format import format_table
-from rcirl_jax.evaluation.ranking.table import RankingReport
+from rcirl_jax.evaluation.ranking.report import RankingReport, format_table
 from rcirl_jax.export.closed_loop import SuiteJob, run_job
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.gate_job import gate_job, judged

@@ -33,7 +33,6 @@ from rcirl_jax.evaluation.ranking.evaluate import (
     rank_scenes,
     report_of,
 )
-from rcirl_jax.evaluation.ranking.format import format_table, markdown_table
 from rcirl_jax.evaluation.ranking.learners import (
     LEARNERS,
     learner_configs,
@@ -41,8 +40,13 @@ from rcirl_jax.evaluation.ranking.learners import (
     train_learners,
     untrained,
 )
+from rcirl_jax.evaluation.ranking.report import (
+    UNTRAINED_ROW,
+    format_table,
+    markdown_table,
+    to_json,
+)
 from rcirl_jax.evaluation.ranking.score import Baseline
-from rcirl_jax.evaluation.ranking.table import UNTRAINED_ROW, to_json
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
 

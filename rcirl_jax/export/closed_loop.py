@@ -19,7 +19,7 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.suite import (
-    Drive,
+    DriveRow,
     SuiteConfig,
     SuiteResult,
     bar_of,
@@ -221,7 +221,7 @@ def drive_piece(
     )
 
 
-def drive_by(executor: Executor, job: SuiteJob) -> Drive:
+def drive_by(executor: Executor, job: SuiteJob) -> DriveRow:
     """Returns what drives a job's rows; the result does not depend on the executor."""
     if executor.workers == 1:
         return drive_here

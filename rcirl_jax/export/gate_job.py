@@ -6,12 +6,12 @@ from pathlib import Path
 
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop.files import runs_of
 from rcirl_jax.evaluation.closed_loop.likeness import (
     DRIVES,
     LikenessReport,
     held_out_likeness,
 )
+from rcirl_jax.evaluation.closed_loop.runs import runs_of
 from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteConfig,
     SuiteResult,

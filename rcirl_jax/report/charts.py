@@ -15,9 +15,8 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
-from rcirl_jax.evaluation.closed_loop.output import SHORT
-from rcirl_jax.evaluation.closed_loop.summary import SuiteReport
-from rcirl_jax.evaluation.ranking.table import BASELINE_ROWS, RankingReport
+from rcirl_jax.evaluation.closed_loop.summary import SHORT, SuiteReport
+from rcirl_jax.evaluation.ranking.report import BASELINE_ROWS, RankingReport
 from rcirl_jax.report.pages import number, part
 from rcirl_jax.report.style import (
     CHOSEN,

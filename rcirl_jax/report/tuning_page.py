@@ -11,20 +11,24 @@ import tqdm
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.joined import Demonstrations
-from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
-from rcirl_jax.evaluation.closed_loop.output import SHORT
+from rcirl_jax.evaluation.closed_loop.runs import SuiteRuns
 from rcirl_jax.evaluation.closed_loop.summary import (
     PAPER,
-    Comparison,
+    SHORT,
     Rate,
     RowSummary,
+    SuiteComparison,
     SuiteReport,
 )
 from rcirl_jax.evaluation.gate.types import Check, GateConfig, Verdict
 from rcirl_jax.evaluation.gate.words import OUTCOMES, RANKS, TITLES
-from rcirl_jax.evaluation.ranking.format import format_table
 from rcirl_jax.evaluation.ranking.metrics import METRICS
-from rcirl_jax.evaluation.ranking.table import BASELINE_ROWS, SIGNIFICANT, RankingReport
+from rcirl_jax.evaluation.ranking.report import (
+    BASELINE_ROWS,
+    SIGNIFICANT,
+    RankingReport,
+    format_table,
+)
 from rcirl_jax.evaluation.statistics import CONFIDENCE
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.sweep.result import table as sweep_table
@@ -386,7 +390,7 @@ def _safety(
     return Table(caption=title, heads=heads, rows=body, marked=marked)
 
 
-def _comparisons(comparisons: Sequence[Comparison]) -> Table:
+def _comparisons(comparisons: Sequence[SuiteComparison]) -> Table:
     """Return the first row minus every other; call none what is not significant."""
     first = comparisons[0].a
     heads = ("", *(SHORT[name] for name in COLUMNS), "progress, m", "nuPlan")

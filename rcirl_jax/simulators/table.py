@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop.output import text_table
+from rcirl_jax.evaluation.closed_loop.summary import text_table
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
     clopper_pearson,

@@ -12,24 +12,23 @@ from pathlib import Path
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.evaluation.baselines import tune_idm
-from rcirl_jax.evaluation.closed_loop.files import (
-    SuiteRuns,
-    read_runs,
-    runs_of,
-    write_runs,
-)
 from rcirl_jax.evaluation.closed_loop.likeness import (
     held_out_likeness,
     read_arrays,
     write_arrays,
+)
+from rcirl_jax.evaluation.closed_loop.runs import (
+    SuiteRuns,
+    read_runs,
+    runs_of,
+    write_runs,
 )
 from rcirl_jax.evaluation.closed_loop.suite import write_suite
 from rcirl_jax.evaluation.gate.types import CANDIDATE, INCUMBENT, Verdict
 from rcirl_jax.evaluation.gate.verdict import judge, pair_of, write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
-from rcirl_jax.evaluation.ranking.format import format_table
-from rcirl_jax.evaluation.ranking.table import from_json, to_json
+from rcirl_jax.evaluation.ranking.report import format_table, from_json, to_json
 from rcirl_jax.export.closed_loop import SuiteJob, read_tuned_idm, write_tuned_idm
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.gate_job import drive_job, gate_job, left_out

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.evaluation.closed_loop.robustness import (
+from experiments.paper.plans import (
     Disturbance,
     disturbed,
     spread_over,

@@ -7,11 +7,11 @@ import numpy as np
 
 from rcirl_jax.data.importing import import_logs
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
+from rcirl_jax.evaluation.closed_loop.runs import SuiteRuns
 from rcirl_jax.evaluation.gate.types import GateConfig, Pair
 from rcirl_jax.evaluation.gate.verdict import judge
 from rcirl_jax.evaluation.ranking.metrics import Outcomes, random_scorer, scene_metrics
-from rcirl_jax.evaluation.ranking.table import build_report
+from rcirl_jax.evaluation.ranking.report import build_report
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.rank import constant_speed_policy, idm_policy

@@ -22,7 +22,7 @@ from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.files import MANIFEST, MARK
 from rcirl_jax.data.store.shards import describe
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop.files import (
+from rcirl_jax.evaluation.closed_loop.runs import (
     COLUMNS,
     SuiteRuns,
     read_runs,

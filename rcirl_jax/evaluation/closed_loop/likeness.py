@@ -23,13 +23,13 @@ import tqdm
 from scipy.spatial.distance import jensenshannon
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop.npz_files import (
+from rcirl_jax.evaluation.closed_loop.runs import (
     check_array,
     names_of_rows,
     read_npz,
     write_npz,
 )
-from rcirl_jax.evaluation.closed_loop.output import text_table
+from rcirl_jax.evaluation.closed_loop.summary import text_table
 from rcirl_jax.evaluation.gate.types import Likeness
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,

@@ -10,13 +10,14 @@ import numpy as np
 import tqdm
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop.output import (
+from rcirl_jax.evaluation.closed_loop.summary import (
+    SuiteReport,
     format_families,
     format_suite,
     result_hash,
+    summarise,
     write_csv,
 )
-from rcirl_jax.evaluation.closed_loop.summary import SuiteReport, summarise
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
 from rcirl_jax.runtime.compiling import CompilesFirst
 from rcirl_jax.runtime.executors import two_at_a_time
@@ -44,7 +45,7 @@ class SuiteConfig:
     chunk: int = 180
 
 
-Drive = Callable[[Row, CaseSet, SuiteConfig], CaseMetrics]
+DriveRow = Callable[[Row, CaseSet, SuiteConfig], CaseMetrics]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,9 +87,8 @@ def drive_here(row: Row, cases: CaseSet, config: SuiteConfig) -> CaseMetrics:
         )
 
 
-def _driven(row: Row, cases: CaseSet, config: SuiteConfig, drive: Drive) -> CaseMetrics:
-    """A row's drives; InputError names the first case with no number."""
-    metrics = drive(row, cases, config)
+def _check_numbers(row: Row, cases: CaseSet, metrics: CaseMetrics) -> None:
+    """Raises InputError that names the first case with no number."""
     for field, values in vars(metrics).items():
         values = np.asarray(values).reshape(len(cases.ids), -1)
         none = field in NOBODY_MET
@@ -100,41 +100,34 @@ def _driven(row: Row, cases: CaseSet, config: SuiteConfig, drive: Drive) -> Case
                 f"simulate: {row.name}: case {cases.ids[first]}: {field}: {found}: "
                 "expected a number"
             )
-    return metrics
-
-
-def _all_driven(
-    rows: Sequence[Row], cases: CaseSet, config: SuiteConfig, drive: Drive
-) -> dict[str, tuple[CaseMetrics, float]]:
-    """Every row's drives and seconds, by name."""
-
-    def one(row: Row) -> tuple[CaseMetrics, float]:
-        begin = time.perf_counter()
-        found = _driven(row, cases, config, drive)
-        return found, time.perf_counter() - begin
-
-    short = len(cases.ids) * cases.duration_s <= SHORT_S
-    # other places to drive in take one row after the other
-    aside = short and drive is drive_here
-    found = two_at_a_time(one, rows) if aside else [one(row) for row in rows]
-    return dict(zip([row.name for row in rows], found, strict=True))
 
 
 def run_suite(
     rows: Sequence[Row],
     cases: CaseSet,
     config: SuiteConfig,
-    drive: Drive = drive_here,
+    drive: DriveRow = drive_here,
 ) -> SuiteResult:
-    """Drive every row over the cases and judge them; `drive` says where.
+    """Drives every row over the cases and judge them; `drive` says where.
 
     The careful drivers and IDM drive too: they say which cases are
     preventable and how far one gets. Where the recorded human is a row, its
     distance is the reference instead of IDM's.
     """
-    every = {row.name: row for row in [*rows, *judges()]}
-    timed = _all_driven([*every.values()], cases, config, drive)
-    driven = {name: found for name, (found, _) in timed.items()}
+    every = [*{row.name: row for row in [*rows, *judges()]}.values()]
+
+    def one(row: Row) -> tuple[CaseMetrics, float]:
+        begin = time.perf_counter()
+        found = drive(row, cases, config)
+        _check_numbers(row, cases, found)
+        return found, time.perf_counter() - begin
+
+    # other places to drive in take one row after the other
+    short = len(cases.ids) * cases.duration_s <= SHORT_S
+    aside = short and drive is drive_here
+    made = two_at_a_time(one, every) if aside else [one(row) for row in every]
+    timed = dict(zip([row.name for row in every], made, strict=True))
+    driven = {name: metrics for name, (metrics, _) in timed.items()}
     avoidable = preventable([driven["CC"], driven["FSM"]])
     calm = trivial([driven["IDM"], driven["constant speed"]])
     runs = {row.name: driven[row.name] for row in rows}
@@ -187,16 +180,3 @@ def write_suite(
         result.cases.parameters,
     )
     return text
-
-
-def worst_cases(result: SuiteResult, row: str, count: int = 10) -> list[str]:
-    """Ids of the cases of a row to look at first: faults, red lights, low progress."""
-    metrics = result.runs[row]
-    key = (
-        1000.0 * (np.asarray(metrics.at_fault) > 0)
-        + 100.0 * (np.asarray(metrics.red_lights) > 0)
-        + 100.0 * (np.asarray(metrics.stop_signs) > 0)
-        + np.asarray(metrics.max_j) / 100.0
-    )
-    order = np.argsort(-key, kind="stable")[:count]
-    return [result.cases.ids[i] for i in order.tolist()]

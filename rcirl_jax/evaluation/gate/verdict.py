@@ -14,9 +14,9 @@ import jax
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
-from rcirl_jax.evaluation.closed_loop.output import result_hash
+from rcirl_jax.evaluation.closed_loop.runs import SuiteRuns
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, SuiteResult
+from rcirl_jax.evaluation.closed_loop.summary import result_hash
 from rcirl_jax.evaluation.gate import checks as rules
 from rcirl_jax.evaluation.gate.types import (
     CANDIDATE,

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rcirl_jax.evaluation.closed_loop.output import text_table
+from rcirl_jax.evaluation.closed_loop.summary import text_table
 from rcirl_jax.evaluation.gate.types import INCUMBENT, Check, NewFault, Pair, Verdict
 from rcirl_jax.simulation.catalogue.families import family_title
 

@@ -17,6 +17,7 @@ from rcirl_jax.evaluation.ranking.metrics import (
     random_scorer,
     scene_metrics,
 )
+from rcirl_jax.evaluation.ranking.report import RankingReport, build_report
 from rcirl_jax.evaluation.ranking.score import (
     BASELINES,
     Baseline,
@@ -27,7 +28,6 @@ from rcirl_jax.evaluation.ranking.score import (
     measure_scenes,
     score_scenes,
 )
-from rcirl_jax.evaluation.ranking.table import RankingReport, build_report
 from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Demonstration

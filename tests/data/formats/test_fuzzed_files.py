@@ -23,7 +23,7 @@ from rcirl_jax.data.readers.sqlite import Database
 from rcirl_jax.data.readers.tables import table
 from rcirl_jax.data.readers.tables.ledger import Ledger
 from rcirl_jax.data.readers.xml import read_xml
-from rcirl_jax.evaluation.closed_loop.files import read_runs
+from rcirl_jax.evaluation.closed_loop.runs import read_runs
 from rcirl_jax.runtime.specs import load_toml
 from rcirl_jax.train import checkpoint
 from tests.conftest import REPO
@@ -134,7 +134,7 @@ def test_a_suite_packed_in_ways_that_are_not_ours(members, packing):
 
 def test_a_suite_that_unpacks_to_gigabytes_is_refused(members, monkeypatch):
     file, content = members
-    monkeypatch.setattr("rcirl_jax.evaluation.closed_loop.npz_files.MAX_BYTES", 2**20)
+    monkeypatch.setattr("rcirl_jax.evaluation.closed_loop.runs.MAX_BYTES", 2**20)
     zeros = npy(np.zeros(2**18))
     file.write_bytes(archive_of({**content, "way.npy": zeros}, zipfile.ZIP_DEFLATED))
     assert file.stat().st_size < 2**20

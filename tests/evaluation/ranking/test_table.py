@@ -9,7 +9,6 @@ import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.evaluate import Ranked, pooled
-from rcirl_jax.evaluation.ranking.format import format_table, markdown_table
 from rcirl_jax.evaluation.ranking.metrics import (
     METRICS,
     Outcomes,
@@ -18,10 +17,12 @@ from rcirl_jax.evaluation.ranking.metrics import (
     random_scorer,
     scene_metrics,
 )
-from rcirl_jax.evaluation.ranking.table import (
+from rcirl_jax.evaluation.ranking.report import (
     BASELINE_ROWS,
     build_report,
+    format_table,
     from_json,
+    markdown_table,
     to_json,
     verdict,
 )
