@@ -97,9 +97,9 @@ def _rows() -> dict[str, Row]:
             jax.vmap(policy, in_axes=(None, 0, 0, 0)),
             (weights, scenes, keys, plan),
         ),
-        "loop, constant speed": (loop(constant_speed_policy), (None, cases)),
-        "loop, learned": (loop(policy), (weights, cases)),
-        "loop, hand-set": (
+        "loop: constant speed": (loop(constant_speed_policy), (None, cases)),
+        "loop: learned": (loop(policy), (weights, cases)),
+        "loop: hand-set": (
             loop(rank_policy(hand_score, RankConfig())),
             (None, cases),
         ),

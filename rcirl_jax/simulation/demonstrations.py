@@ -188,7 +188,7 @@ def _drive_all(
         steps=round(config.duration_s / STEP_S),
         plan_every=every,
         scenes=True,
-        turns=(round(learner_s / STEP_S), round(driver_s / STEP_S)),
+        takeover_schedule=(round(learner_s / STEP_S), round(driver_s / STEP_S)),
     )
     quality, pending, lineage = QualityReport(), [], []
     names: list[str] = []
@@ -233,11 +233,11 @@ def _drives(
     cases = with_destinations(build(refs, config.duration_s), first, config)
     fill = np.minimum(np.arange(CHUNK), len(refs) - 1)
     full = jax.tree.map(lambda leaf: leaf[fill], cases)
-    (policy, params), relief = expert, None
+    (policy, params), other = expert, None
     if learner:
-        policy, params, relief = learner[0], (learner[1], params), policy
+        policy, params, other = learner[0], (learner[1], params), policy
     record, _, scenes = jax.tree.map(
-        np.asarray, drive_cases(policy, params, full, rollout, relief=relief)
+        np.asarray, drive_cases(policy, params, full, rollout, takeover_policy=other)
     )
     for i in range(len(refs)):
         one = lambda x, i=i: x[i]  # noqa: E731

@@ -1,9 +1,12 @@
-"""Closed loop: scan over time, vmap over cases, chunks to bound memory.
+"""Closed loop: scan over time, vmap over cases, groups of one size on a CPU.
 
 The only file of the simulator that names `jit`, `vmap` or `scan` over cases and time.
 A policy is a pure function `(params, scene, key, before) -> Plan`, `before` being the
 plan in force; between two plans the ego follows the plan. Weights are arguments, so the
 compiled program serves every weights file of one shape.
+
+What is scanned is the step of all cases side by side: a scan under `vmap` would be
+traced once for one case and again for many.
 """
 
 import concurrent.futures
@@ -11,11 +14,12 @@ import dataclasses
 import functools
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.plan import Plan, command, later, no_plan, stations_from_now
@@ -47,8 +51,8 @@ class RolloutConfig:
     command_delay: int = 0
     # m/s^3, how fast the ego's braking may build up; None: as the actuator does
     braking_jerk: float | None = None
-    # steps that the policy, then the relief drive in turn (with a relief only)
-    turns: tuple[int, int] = (80, 140)
+    # steps that the policy, then the takeover policy drive in turn (where there is one)
+    takeover_schedule: tuple[int, int] = (80, 140)
     # keep the agents and plans for pictures
     snapshots: bool = False
     # keep the planning frames, one per plan
@@ -68,63 +72,67 @@ class RolloutConfig:
             )
 
 
-def drive_case(
+def rollout(
     policy: Policy,
     params: Params,
-    case: Case,
+    cases: Case,
     config: RolloutConfig,
-    relief: Policy | None = None,
+    takeover_policy: Policy | None = None,
 ) -> tuple[Record, Snapshot | None, Scene | None]:
-    """One case from start to end.
+    """Drive cases [B] from start to end, side by side.
 
-    With a `relief` the two drive in turn, the policy for `turns[0]` steps, then the
-    relief for `turns[1]`; `params` is then the pair of their weights.
+    With a `takeover_policy` the two drive in turn, the policy for
+    `takeover_schedule[0]` steps, then the other for `takeover_schedule[1]`; `params` is
+    then the pair of their weights.
 
     Returns:
-      The record [S], and where the configuration asks for them the snapshots
-      [S] and the planning frames [S / plan_every].
+      The record [S, B], and where the configuration asks for them the snapshots
+      [S, B] and the planning frames [S / plan_every, B]; time comes first.
     """
-    limit = road_limit(case.road)
-    key = jax.random.fold_in(jax.random.key(case.seed), SAMPLER_STREAM)
+    limits = jax.vmap(lambda case: road_limit(case.road))(cases)
+    stream = lambda seed: jax.random.fold_in(jax.random.key(seed), SAMPLER_STREAM)  # noqa: E731
+    keys = jax.vmap(stream)(cases.seed)
+
+    def plan_of(scene: Scene, key: jax.Array, now: World, before: Plan) -> Plan:
+        with jax.named_scope("policy"):
+            draw = jax.random.fold_in(key, now.step)
+            if takeover_policy is None:
+                return policy(params, scene, draw, before)
+            plan = policy(params[0], scene, draw, before)
+            other = takeover_policy(params[1], scene, draw, before)
+            first, second = config.takeover_schedule
+            taken_over = now.step % (first + second) >= first
+            return jax.tree.map(lambda x, y: jnp.where(taken_over, x, y), other, plan)
+
+    def tick(
+        case: Case, now: World, waiting: jax.Array, plan: Plan
+    ) -> tuple[tuple[World, jax.Array, Plan], tuple[Record, Snapshot | None]]:
+        asked = command(plan, now.ego.v)
+        waiting = jnp.concatenate([asked[None], waiting])
+        late, waiting = waiting[-1], waiting[:-1]
+        applied = _build_up(late, now.ego.a, config)
+        after, record = step(
+            case, now, applied, plan.fallback, config.vehicle, config.follow_log
+        )
+        shot = _snapshot(case, now, after, plan) if config.snapshots else None
+        return (after, waiting, later(plan, STEP_S)), (record, shot)
 
     def plan_and_drive(carry: tuple, _: None) -> tuple[tuple, tuple]:
-        world, queue, before = carry
-        scene = observe(case, world, limit)
-        with jax.named_scope("policy"):
-            draw = jax.random.fold_in(key, world.step)
-            own = params if relief is None else params[0]
-            plan = policy(own, scene, draw, before)
-            if relief is not None:
-                relieved = world.step % sum(config.turns) >= config.turns[0]
-                other = relief(params[1], scene, draw, before)
-                plan = jax.tree.map(
-                    lambda yes, no: jnp.where(relieved, yes, no), other, plan
-                )
+        worlds, waiting, before = carry
+        scenes = jax.vmap(observe)(cases, worlds, limits)
+        plans = jax.vmap(plan_of)(scenes, keys, worlds, before)
+        carry, logs = jax.lax.scan(
+            lambda now, _: jax.vmap(tick)(cases, *now),
+            (worlds, waiting, plans),
+            length=config.plan_every,
+        )
+        return carry, (logs, scenes if config.scenes else None)
 
-        def tick(carry: tuple, _: None) -> tuple[tuple, tuple]:
-            now, waiting, ahead = carry
-            asked = command(ahead, now.ego.v)
-            waiting = jnp.concatenate([asked[None], waiting])
-            late, waiting = waiting[-1], waiting[:-1]
-            after, record = step(
-                case,
-                now,
-                _build_up(late, now.ego.a, config),
-                ahead.fallback,
-                config.vehicle,
-                config.follow_log,
-            )
-            shot = _snapshot(case, now, after, ahead) if config.snapshots else None
-            ahead = later(ahead, STEP_S)
-            return (after, waiting, ahead), (record, shot)
-
-        begin = (world, queue, plan)
-        carry, logs = jax.lax.scan(tick, begin, None, length=config.plan_every)
-        return carry, (logs, scene if config.scenes else None)
-
+    count = cases.steps.shape[0]
+    nothing = jax.tree.map(lambda x: jnp.stack([x] * count), no_plan())
+    begin = (jax.vmap(start)(cases), jnp.zeros((count, config.command_delay)), nothing)
     plans = config.steps // config.plan_every
-    begin = (start(case), jnp.zeros((config.command_delay,)), no_plan())
-    _, (logs, scenes) = jax.lax.scan(plan_and_drive, begin, None, length=plans)
+    _, (logs, scenes) = jax.lax.scan(plan_and_drive, begin, length=plans)
     flat = lambda x: x.reshape(config.steps, *x.shape[2:])  # noqa: E731
     return *jax.tree.map(flat, logs), scenes
 
@@ -154,16 +162,17 @@ def _compiled(
     policy: Policy,
     reduce: Callable[[Record], Logs] | None,
     config: RolloutConfig,
-    relief: Policy | None,
+    takeover_policy: Policy | None,
     keep: bool,
 ) -> Callable:
-    def run(params: Params, case: Case) -> Logs:
-        logs = drive_case(policy, params, case, config, relief)
+    def run(params: Params, cases: Case) -> Logs:
+        logs = rollout(policy, params, cases, config, takeover_policy)
         if reduce is None:
             return logs
-        return (reduce(logs[0]), logs) if keep else reduce(logs[0])
+        made = jax.vmap(reduce, in_axes=1)(logs[0])
+        return (made, logs) if keep else made
 
-    return jax.jit(jax.vmap(run, in_axes=(None, 0)))
+    return jax.jit(run)
 
 
 # Cases a CPU drives side by side. XLA compiles other code for other shapes and
@@ -178,7 +187,7 @@ def drive_cases(
     cases: Case,
     config: RolloutConfig,
     reduce: Callable[[Record], Logs] | None = None,
-    relief: Policy | None = None,
+    takeover_policy: Policy | None = None,
     *,
     keep: bool = False,
 ) -> Logs:
@@ -191,42 +200,38 @@ def drive_cases(
 
     Args:
       policy: who drives.
-      params: its weights; with a relief the pair of both.
+      params: its weights; with a takeover policy the pair of both.
       cases: leaves [B, ...].
       config: of the rollouts.
       reduce: record [S] -> what is wanted of it.
-      relief: drives in turn with the policy.
+      takeover_policy: drives in turn with the policy.
       keep: with `reduce` (what it makes, logs with snapshots) instead.
+
+    Returns:
+      Leaves [B, ...]; records and snapshots [B, S, ...], as numpy arrays.
     """
     total = cases.steps.shape[0]
     in_groups = total % LANES == 0 and jax.default_backend() == "cpu"
     keeps = reduce is not None and (keep or in_groups)
     if keeps:
         config = dataclasses.replace(config, snapshots=True)
-    drive = _compiled(policy, reduce, config, relief, keeps)
-    if not in_groups:
-        return drive(params, cases)
+    drive = _compiled(policy, reduce, config, takeover_policy, keeps)
 
     def group(first: int) -> Logs:
-        lanes = slice(first, first + LANES)
+        lanes = slice(first, first + (LANES if in_groups else total))
         part = jax.tree.map(lambda leaf: leaf[lanes], cases)
         made = jax.block_until_ready(drive(params, part))
-        return made[0] if keeps and not keep else made
+        # time comes first in the program: a view, where a program would copy
+        by_case = lambda x: np.swapaxes(np.asarray(x), 0, 1)  # noqa: E731
+        if reduce is None:
+            return jax.tree.map(by_case, made)
+        if keep:
+            return made[0], jax.tree.map(by_case, made[1])
+        return made[0] if keeps else made
 
+    if not in_groups:
+        return group(0)
     # a group keeps one core busy: its operations are too small to be shared
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
         groups = list(pool.map(group, range(0, total, LANES)))
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *groups)
-
-
-def chunks(cases: Case, size: int) -> Iterator[tuple[Case, int]]:
-    """Cases in chunks of one size; the last is filled up with its first case.
-
-    Yields:
-      (chunk, count): only the first `count` cases of the chunk are new.
-    """
-    total = cases.steps.shape[0]
-    for first in range(0, total, size):
-        count = min(size, total - first)
-        index = jnp.minimum(jnp.arange(size) + first, first + count - 1)
-        yield jax.tree.map(lambda x, i=index: jnp.asarray(x)[i], cases), count
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *groups)

@@ -178,16 +178,16 @@ def test_plan_every_has_to_divide_the_steps(bad):
         RolloutConfig(**bad)
 
 
-def test_policy_and_relief_take_turns():
-    """The policy brakes for 3 s, the relief accelerates for 2 s, and again."""
-    config = RolloutConfig(steps=100, turns=(30, 20))
+def test_policy_and_takeover_policy_take_turns():
+    """The policy brakes for 3 s, the other accelerates for 2 s, and again."""
+    config = RolloutConfig(steps=100, takeover_schedule=(30, 20))
 
     record, *_ = drive_cases(
         constant,
         (jnp.float32(-1.0), jnp.float32(1.0)),
         stack([make_case(speed=20.0)]),
         config,
-        relief=constant,
+        takeover_policy=constant,
     )
     command = np.asarray(record.command)[0]
     expected = np.where(np.arange(100) % 50 < 30, -1.0, 1.0)
