@@ -73,7 +73,7 @@ def _rows() -> dict[str, Row]:
 
     def loop(drive: Callable) -> Callable:
         config = RolloutConfig(steps=STEPS, snapshots=True)
-        return rollout._compiled(drive, _reduced, config, None, True)  # noqa: SLF001
+        return rollout._compiled(drive, _reduced, config, None, True)
 
     return {
         "sampler": (draw, (keys, scenes)),

@@ -26,9 +26,7 @@ from rcirl_jax.sampling import (
     trajectory_from_positions,
     trajectory_on_path,
 )
-from rcirl_jax.sampling.config import MODES
-from rcirl_jax.sampling.sampler import within_limits
-from rcirl_jax.sampling.speed import family_index
+from rcirl_jax.sampling.sampler import MODES, family_index, within_limits
 from rcirl_jax.train.loop import in_chunks
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.types import Candidates, Scene, Trajectory

@@ -34,7 +34,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, oracle_floor
 from rcirl_jax.runtime.atomic_files import write_whole
 from rcirl_jax.sampling import SamplerConfig
-from rcirl_jax.sampling.config import MODES
+from rcirl_jax.sampling.sampler import MODES
 
 USUAL = (
     *("input", "output", "format", "source", "suggest", "overwrite", "recipe"),

@@ -57,8 +57,9 @@ def candidate_frames(scene: Scene, trajectories: Trajectory) -> Frame:
     lanes of the processor's vectors are filled.
     """
     view = jax.vmap(path_view, in_axes=(None, 0))(scene, trajectories.s)
-    points = jax.tree.map(jnp.transpose, (trajectories, view))
-    return _grid(scene, *points)
+    leaves, tree = jax.tree.flatten((trajectories, view))
+    points = jnp.stack(leaves).swapaxes(1, 2)  # one copy instead of one a leaf
+    return _grid(scene, *jax.tree.unflatten(tree, points))
 
 
 def _grid(scene: Scene, trajectory: Trajectory, view: PathView) -> Frame:

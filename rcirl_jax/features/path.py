@@ -1,7 +1,7 @@
 """The scene's path at given stations, by few gathers.
 
 A table lookup costs a gather of two neighbours, and a CPU pays for every number that
-it gathers. What is read together stands in one of three tables; XLA drops a table that
+it gathers. What is read together stands in one of four tables; XLA drops a table that
 nobody reads.
 """
 
@@ -26,6 +26,8 @@ class PathView(flax.struct.PyTreeNode, kw_only=True):
     kappa: jax.Array  # 1/m, curvature of the reference line
     dkappa: jax.Array  # 1/m^2, its slope
     speed_limit: jax.Array  # m/s
+    road_left: jax.Array  # m, lateral offset of the drivable area's left edge
+    road_right: jax.Array  # m, of its right edge
 
     def curvature(self, trajectory: Trajectory) -> jax.Array:
         """Curvature 1/m of the path that the trajectory drives; any equal shape."""
@@ -37,7 +39,8 @@ class PathView(flax.struct.PyTreeNode, kw_only=True):
 
 def table_slope(table: Float[Array, " p"], points: int) -> Float[Array, " p"]:
     """Central difference over `points` grid points on each side, by station."""
-    padded = jnp.pad(table, points, mode="edge")
+    first, last = (jnp.broadcast_to(table[i], (points,)) for i in (0, -1))
+    padded = jnp.concatenate([first, table, last])
     return (padded[2 * points :] - padded[: -2 * points]) / (
         2.0 * points * STATION_STEP_M
     )
@@ -55,11 +58,20 @@ def path_view(scene: Scene, s: Float[Array, " t"]) -> PathView:
     def at(*columns: jax.Array) -> jax.Array:
         table = jnp.stack(columns)
         rise = jnp.pad(table[:, 1:] - table[:, :-1], ((0, 0), (0, 1)))
-        return entries(table, low) + share * entries(rise, low)
+        start, slope = jnp.split(entries(jnp.concatenate([table, rise]), low), 2)
+        return start + share * slope
 
     l, dl_at, ddl = at(path.l, dl, table_slope(dl, SLOPE_POINTS))
     kappa, dkappa = at(path.kappa, table_slope(path.kappa, 1))
     (limit,) = at(path.speed_limit)
+    road_left, road_right = at(path.road_left, path.road_right)
     return PathView(
-        l=l, dl=dl_at, ddl=ddl, kappa=kappa, dkappa=dkappa, speed_limit=limit
+        l=l,
+        dl=dl_at,
+        ddl=ddl,
+        kappa=kappa,
+        dkappa=dkappa,
+        speed_limit=limit,
+        road_left=road_left,
+        road_right=road_right,
     )

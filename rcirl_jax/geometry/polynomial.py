@@ -2,7 +2,8 @@
 
 Source: Werling et al. 2010, "Optimal trajectory generation for dynamic street
 scenarios in a Frenet frame". Time is normalised by the duration inside, so
-that float32 keeps its digits for short and for long moves.
+that float32 keeps its digits for short and for long moves. All functions are
+elementwise: an array of end conditions gives an array of curves.
 """
 
 import jax
@@ -10,12 +11,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 MIN_DURATION = 1e-3  # s (or m): shorter moves are stretched to this
-Scalar = Float[Array, ""] | float
+Scalar = Float[Array, "..."] | float
 
 
 def quartic(
     s0: Scalar, v0: Scalar, a0: Scalar, v1: Scalar, a1: Scalar, duration: Scalar
-) -> Float[Array, "5"]:
+) -> Float[Array, "*batch 5"]:
     """Coefficients of the quartic from (s0, v0, a0) to end speed v1 and a1.
 
         s(t) = c0 + c1 t + c2 t^2 + c3 t^3 + c4 t^4,  s'(d) = v1, s''(d) = a1
@@ -38,7 +39,7 @@ def quintic(
     v1: Scalar,
     a1: Scalar,
     duration: Scalar,
-) -> Float[Array, "6"]:
+) -> Float[Array, "*batch 6"]:
     """Coefficients of the quintic from (s0, v0, a0) to (s1, v1, a1).
 
     s(t) = sum_i c_i t^i, i = 0..5, matching value and two derivatives at
@@ -55,21 +56,26 @@ def quintic(
 
 
 def _stack(*coefficients: Scalar) -> jax.Array:
-    return jnp.stack([jnp.asarray(c, jnp.float32) for c in coefficients])
+    parts = [jnp.asarray(c, jnp.float32) for c in coefficients]
+    return jnp.stack(jnp.broadcast_arrays(*parts), axis=-1)
 
 
 def evaluate(
-    coefficients: Float[Array, " c"], t: Scalar
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Value and first three derivatives at t, by Horner's scheme."""
-    values = []
-    row = coefficients
+    coefficients: Float[Array, "*#batch c"], t: Scalar
+) -> tuple[
+    Float[Array, "*batch"],
+    Float[Array, "*batch"],
+    Float[Array, "*batch"],
+    Float[Array, "*batch"],
+]:
+    """Value and first three derivatives at t, by Horner's scheme; elementwise."""
+    values, row = [], coefficients
     for _ in range(4):
         total = jnp.zeros((), jnp.float32)
-        for c in row[::-1]:
-            total = total * t + c
+        for i in reversed(range(row.shape[-1])):
+            total = total * t + row[..., i]
         values.append(total)
-        row = row[1:] * jnp.arange(1, row.shape[0], dtype=jnp.float32)
+        row = row[..., 1:] * jnp.arange(1, row.shape[-1], dtype=jnp.float32)
     return values[0], values[1], values[2], values[3]
 
 

@@ -15,12 +15,11 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
-from rcirl_jax.geometry.running import running_max
 from rcirl_jax.planner.plan import Plan, stations_from_now
 from rcirl_jax.planner.safety import SafetyConfig, check
 from rcirl_jax.sampling import SamplerConfig, trajectory_on_path
-from rcirl_jax.sampling.sampler import within_limits
-from rcirl_jax.sampling.speed import family_index
+from rcirl_jax.sampling.kinematics import running_max
+from rcirl_jax.sampling.sampler import family_index, within_limits
 from rcirl_jax.types import Candidates, Scene
 
 Tree = Any
@@ -105,6 +104,7 @@ def committed(
       safety: the filter that it has to pass.
       commitment: s for which a plan is kept.
     """
+    anew = jax.jit(anew)  # traced once for one lane and for a batch
 
     def policy(
         params: Tree, scene: Scene, key: jax.Array, before: Plan | None = None

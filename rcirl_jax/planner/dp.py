@@ -44,7 +44,7 @@ from rcirl_jax.planner.rank import (
 from rcirl_jax.reward.module import product
 from rcirl_jax.sampling import sample
 from rcirl_jax.sampling.kinematics import trajectory_on_path
-from rcirl_jax.sampling.speed import family_index
+from rcirl_jax.sampling.sampler import family_index
 from rcirl_jax.types import Candidates, Scene, Trajectory
 from rcirl_jax.units import DT_S, NUM_TIMES
 

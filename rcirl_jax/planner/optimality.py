@@ -15,9 +15,8 @@ from rcirl_jax.planner.dp import plan_dp
 from rcirl_jax.planner.grid import DpConfig, Weights
 from rcirl_jax.planner.rank import learned_score
 from rcirl_jax.planner.safety import SafetyConfig, check
-from rcirl_jax.sampling.config import SamplerConfig
 from rcirl_jax.sampling.kinematics import trajectory_on_path
-from rcirl_jax.sampling.speed import emergency
+from rcirl_jax.sampling.sampler import SamplerConfig, emergency
 from rcirl_jax.types import Candidates, Scene, Trajectory
 
 MIN_SPREAD = 1e-6  # V, difference below which g is not defined

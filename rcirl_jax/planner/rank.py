@@ -23,7 +23,7 @@ from rcirl_jax.reward.hand import LatticeCost, lattice_costs
 from rcirl_jax.reward.module import ACTIVATIONS, ValueNetwork, module_value
 from rcirl_jax.reward.speed_dp import speed_dp_cost
 from rcirl_jax.sampling import SamplerConfig, sample
-from rcirl_jax.sampling.speed import family_index
+from rcirl_jax.sampling.sampler import family_index
 from rcirl_jax.types import (
     Candidates,
     Kind,

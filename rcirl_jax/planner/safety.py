@@ -23,9 +23,8 @@ import jax.numpy as jnp
 from rcirl_jax.errors import InputError
 from rcirl_jax.features.path import path_view
 from rcirl_jax.geometry.boxes import frenet_extent
-from rcirl_jax.geometry.frenet import lookup
 from rcirl_jax.types import Candidates, Kind, Scene, Trajectory
-from rcirl_jax.units import DT_S, STATION_STEP_M, TIMES_S
+from rcirl_jax.units import DT_S, TIMES_S
 
 MOVING_MPS = 1.0  # m/s, above which a body's prediction is uncertain
 CROSSING_MPS = 1.0  # m/s, sideways speed above which a body crosses and leads nobody
@@ -243,11 +242,8 @@ def _inside_limits(scene: Scene, x: Trajectory, config: SafetyConfig) -> jax.Arr
     limit = jnp.minimum(view.speed_limit, before) + config.speed_slack
     allowed = jnp.maximum(limit, scene.ego.v - config.speed_recovery * times)
     slow = x.v <= allowed
-    at = jax.vmap(lookup, in_axes=(None, 0, None))
     half = 0.5 * scene.ego.width
-    left = at(scene.path.road_left, x.s, STATION_STEP_M)
-    right = at(scene.path.road_right, x.s, STATION_STEP_M)
-    outside = jnp.maximum(x.l + half - left, right - (x.l - half))
+    outside = jnp.maximum(x.l + half - view.road_left, view.road_right - (x.l - half))
     on_road = (outside <= 0.0) | (outside <= outside[0] + 0.01)
     gentle = jnp.abs(x.v**2 * view.curvature(x)) <= config.max_lateral_acceleration
     return jnp.all((slow & on_road & gentle)[1:])

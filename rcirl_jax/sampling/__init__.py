@@ -1,9 +1,13 @@
 """Candidate trajectories: one sampler, offline and online."""
 
-from rcirl_jax.sampling.config import SamplerConfig
 from rcirl_jax.sampling.kinematics import trajectory_from_positions, trajectory_on_path
-from rcirl_jax.sampling.sampler import hard_negatives, num_candidates, sample
-from rcirl_jax.sampling.speed import FAMILIES
+from rcirl_jax.sampling.sampler import (
+    FAMILIES,
+    SamplerConfig,
+    hard_negatives,
+    num_candidates,
+    sample,
+)
 
 __all__ = [
     "FAMILIES",

@@ -7,12 +7,15 @@ and leaves with derivatives made here.
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rcirl_jax.features.path import path_view
 from rcirl_jax.types import Scene, Trajectory
-from rcirl_jax.units import DT_S
+from rcirl_jax.units import DT_S, NUM_TIMES
 
+FIRST = np.arange(NUM_TIMES) == 0  # [T]
+LONG_AXIS, BLOCK = 32, 8  # points beyond which a running extremum works in blocks
 MIN_ADVANCE_M = 1.0  # m between neighbours below which dl/ds is taken as 0
 
 
@@ -42,17 +45,15 @@ def differentiate(
       v [T] m/s, a [T] m/s^2, j [T] m/s^3. Beyond the last valid time they are
       finite and meaningless.
     """
-    ahead = jnp.concatenate([s[1:], s[-1:]])
-    behind = jnp.concatenate([s[:1], s[:-1]])
+    behind, ahead = _neighbours(s)
     has_next = jnp.concatenate([time_valid[1:], jnp.zeros_like(time_valid[:1])])
-    central_a = (ahead - 2.0 * s + behind) / DT_S**2
-    central_a = central_a.at[0].set(a0)
-    carried_a = jnp.concatenate([central_a[:1], central_a[:-1]])
+    central_a = jnp.where(FIRST, a0, (ahead - 2.0 * s + behind) / DT_S**2)
+    carried_a, _ = _neighbours(central_a)
     a = jnp.where(has_next, central_a, carried_a)
     v = jnp.where(
         has_next, (ahead - behind) / (2.0 * DT_S), (s - behind) / DT_S + 0.5 * a * DT_S
     )
-    v = v.at[0].set(v0)
+    v = jnp.where(FIRST, v0, v)
     step = (a[1:] - a[:-1]) / DT_S
     return v, a, jnp.concatenate([step[:1], step])
 
@@ -80,14 +81,21 @@ def lateral_derivatives(
     advance = _spread(s)
     moves = advance > MIN_ADVANCE_M
     safe = jnp.where(moves, advance, 1.0)
-    dl = jnp.where(moves, _spread(l) / safe, 0.0).at[0].set(dl0)
-    ddl = jnp.where(moves, _spread(dl) / safe, 0.0).at[0].set(ddl0)
+    dl = jnp.where(FIRST, dl0, jnp.where(moves, _spread(l) / safe, 0.0))
+    ddl = jnp.where(FIRST, ddl0, jnp.where(moves, _spread(dl) / safe, 0.0))
     return dl, ddl
+
+
+def _neighbours(x: Float[Array, " t"]) -> tuple[Float[Array, " t"], Float[Array, " t"]]:
+    """x_{i-1} and x_{i+1}; at the ends the end itself."""
+    padded = jnp.concatenate([x[:1], x, x[-1:]])
+    return padded[:-2], padded[2:]
 
 
 def _spread(x: Float[Array, " t"]) -> Float[Array, " t"]:
     """x_{i+1} - x_{i-1}, one-sided at both ends."""
-    return jnp.concatenate([x[1:], x[-1:]]) - jnp.concatenate([x[:1], x[:-1]])
+    behind, ahead = _neighbours(x)
+    return ahead - behind
 
 
 def trajectory_from_positions(
@@ -113,6 +121,35 @@ def trajectory_on_path(scene: Scene, s: Float[Array, " t"]) -> Trajectory:
         a=a,
         j=j,
         l=view.l,
-        dl=view.dl.at[0].set(scene.ego.dl),
-        ddl=view.ddl.at[0].set(scene.ego.ddl),
+        dl=jnp.where(FIRST, scene.ego.dl, view.dl),
+        ddl=jnp.where(FIRST, scene.ego.ddl, view.ddl),
     )
+
+
+def running_max(x: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    """Max over j <= i of x_j, along the last axis.
+
+    A few loops over all pairs within blocks: they compile to few kernels and are faster
+    on short axes than `lax.cummax`, which halves and interleaves its operand.
+    """
+    size = x.shape[-1]
+    if size > LONG_AXIS:
+        blocks = -(-size // BLOCK)
+        rest = [(0, 0)] * (x.ndim - 1) + [(0, blocks * BLOCK - size)]
+        parts = jnp.pad(x, rest, constant_values=-jnp.inf)
+        parts = running_max(parts.reshape(*x.shape[:-1], blocks, BLOCK))
+        before = jnp.pad(
+            running_max(parts[..., -1])[..., :-1],
+            [(0, 0)] * (x.ndim - 1) + [(1, 0)],
+            constant_values=-jnp.inf,
+        )
+        return jnp.maximum(parts, before[..., None]).reshape(*x.shape[:-1], -1)[
+            ..., :size
+        ]
+    upto = np.triu(np.ones((size, size), bool))  # [j, i]: j <= i
+    return jnp.max(jnp.where(upto, x[..., None], -jnp.inf), axis=-2)
+
+
+def remaining_min(x: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+    """Min over j >= i of x_j, along the last axis."""
+    return -running_max(-x[..., ::-1])[..., ::-1]

@@ -1,17 +1,132 @@
-"""The trajectory sampler: (key, scene, config) -> Candidates, offline and online."""
+"""Candidate trajectories: one sampler, offline and online.
+
+Speed profiles are made family by family as end conditions; one call solves the
+polynomials of all of them and one rolls them out. Only positions are made here;
+derivatives come from `kinematics`. All profiles start in the ego's state (s, v, a).
+After its own duration a profile goes on at its end speed; one that reverses stands
+still instead. Offline and online the sampler is the same: (key, scene, config) ->
+Candidates.
+"""
+
+import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rcirl_jax.errors import InputError
 from rcirl_jax.features.columns import driven_curvature
-from rcirl_jax.geometry.running import running_max
-from rcirl_jax.sampling import lateral, speed
-from rcirl_jax.sampling.config import SamplerConfig
-from rcirl_jax.sampling.kinematics import trajectory_from_positions, trajectory_on_path
-from rcirl_jax.types import Candidates, Scene, Trajectory
-from rcirl_jax.units import HORIZON_S, TIMES_S
+from rcirl_jax.features.path import SLOPE_POINTS, table_slope
+from rcirl_jax.geometry.frenet import lookup
+from rcirl_jax.geometry.polynomial import evaluate, quartic, quintic
+from rcirl_jax.sampling.kinematics import (
+    remaining_min,
+    running_max,
+    trajectory_from_positions,
+    trajectory_on_path,
+)
+from rcirl_jax.types import Candidates, Kind, Scene, Trajectory
+from rcirl_jax.units import DT_S, HORIZON_S, NUM_TIMES, STATION_STEP_M, TIMES_S
+
+MODES = ("speed", "path_speed")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SamplerConfig:
+    """Grid, jitter and limits of the sampler. Hashable: a static argument.
+
+    Sources: families and 8 s horizon after Apollo's lattice planner
+    (cruise, stop, follow, overtake); limits after its constraint checker,
+    except that jerk is judged on 0.47 s differences and therefore looser.
+    """
+
+    # "speed": along the scene's given path (the paper's case study);
+    # "path_speed": lateral profiles too.
+    mode: str = "speed"
+    # s, ends of the cruise quartics
+    cruise_times: tuple[float, ...] = (2.0, 3.0, 4.0, 6.0, 8.0)
+    # 1, end speeds as signed shares of the reachable range, dense near v0
+    cruise_levels: tuple[float, ...] = (-1.0, -0.6, -0.3, -0.12, 0.0, 0.12, 0.3, 0.6)
+    # s, times at which obstacles' edges are followed or overtaken
+    edge_times: tuple[float, ...] = (4.0, 8.0)
+    # s, headways kept behind a followed obstacle
+    follow_headways: tuple[float, ...] = (0.4, 0.8, 1.3, 2.0)
+    # number of obstacles followed, nearest first
+    num_followed: int = 2
+    # m, bumper gap kept to a followed obstacle at standstill
+    standstill_gap: float = 2.0
+    # m, clearance ahead of an overtaken obstacle (Apollo: 5 m)
+    overtake_gap: float = 5.0
+    # s, durations of stops at a line
+    stop_times: tuple[float, ...] = (3.0, 5.0, 8.0)
+    # m, front bumper before the line when standing
+    stop_gaps: tuple[float, ...] = (0.5, 2.5)
+    # m/s^2, mean braking of stops without a line
+    stop_brakings: tuple[float, ...] = (0.8, 1.5, 2.5)
+    # drives up to the speed envelope: share of it (1), acceleration, braking
+    # and, in bends, lateral acceleration in m/s^2
+    envelopes: tuple[tuple[float, float, float, float], ...] = (
+        (0.985, 2.0, 0.9, 3.0),
+        (0.965, 1.3, 0.8, 2.5),
+        (0.9, 0.8, 0.6, 1.8),
+    )
+    # m/s^3, how fast their acceleration changes
+    envelope_jerk: float = 3.0
+    # m/s^2, emergency stops, always offered
+    emergency_brakings: tuple[float, ...] = (4.0, 6.0, 8.0)
+    # number of random two-phase profiles
+    num_random: int = 48
+    # m/s^2, mean accelerations that bound the reachable end speeds
+    reach_braking: float = 3.0
+    reach_acceleration: float = 2.0
+    # 1, end speeds are capped at this multiple of the limit at the ego
+    limit_factor: float = 1.2
+    # s, durations from which lateral moves are drawn (times v0 = length)
+    lateral_times: tuple[float, ...] = (3.0, 5.0)
+    # m, shortest lateral move
+    min_lateral_length: float = 15.0
+    # m, offsets of nudges from the lateral position at t = 0
+    nudge_offsets: tuple[float, ...] = (-0.8, -0.4, 0.4, 0.8)
+    # every n-th speed profile is paired with each further lateral profile
+    lateral_stride: int = 4
+    # m/s^2, feasible accelerations (Apollo: -6 to 4)
+    min_acceleration: float = -6.0
+    max_acceleration: float = 4.0
+    # m/s^3, feasible |jerk| on the 0.47 s grid
+    max_jerk: float = 12.0
+    # 1/m (Apollo)
+    max_curvature: float = 0.1979
+    # m/s^2 (Apollo's 4, with room for the noise of recorded paths)
+    max_lateral_acceleration: float = 6.0
+
+    def __post_init__(self) -> None:
+        """Reject an unknown mode."""
+        if self.mode not in MODES:
+            raise InputError(f"mode: {self.mode}: expected one of {MODES}")
+
+
+FAMILIES = (
+    "constant_speed",
+    "cruise",
+    "stop",
+    "follow",
+    "overtake",
+    "envelope",
+    "emergency",
+    "random",
+    "hard_negative",
+    "in_force",  # what is left of the plan that is being driven
+    "given",  # somebody else's, by its positions
+)
+
+MIN_PHASE_S = 0.5  # s, shortest phase of a two-phase profile
+
+
+def family_index(name: str) -> int:
+    """Number of a family in `Candidates.family`."""
+    return FAMILIES.index(name)
 
 
 def _speed_families(config: SamplerConfig) -> np.ndarray:
@@ -28,7 +143,7 @@ def _speed_families(config: SamplerConfig) -> np.ndarray:
         "emergency": len(config.emergency_brakings),
         "random": config.num_random,
     }
-    numbers = [speed.family_index(name) for name in counts]
+    numbers = [family_index(name) for name in counts]
     return np.repeat(numbers, list(counts.values())).astype(np.int32)
 
 
@@ -42,7 +157,7 @@ def _pairs(config: SamplerConfig) -> tuple[np.ndarray, np.ndarray]:
     everyone = np.arange(num_speed)
     strided = everyone[:: config.lateral_stride]
     pairs = [(i, m) for m in (0, 1) for i in everyone]
-    rest = range(2, lateral.num_lateral(config))
+    rest = range(2, num_lateral(config))
     pairs += [(i, m) for m in rest for i in strided]
     grid = np.array(pairs, np.int32)
     return grid[:, 0], grid[:, 1]
@@ -77,7 +192,7 @@ def sample(key: jax.Array, scene: Scene, config: SamplerConfig) -> Candidates:
             allowed = jnp.ones(family.shape, bool)
         else:
             which_speed, which_lateral = _pairs(config)
-            target, length, allowed = lateral.lateral_targets(scene, config)
+            target, length, allowed = lateral_targets(scene, config)
             trajectory = jax.vmap(_with_lateral, in_axes=(None, 0, 0, 0))(
                 scene,
                 stations[which_speed],
@@ -87,7 +202,7 @@ def sample(key: jax.Array, scene: Scene, config: SamplerConfig) -> Candidates:
             family = family[which_speed]
             allowed = allowed[which_lateral] > 0.0
         inside = jax.vmap(lambda x: within_limits(scene, x, config))(trajectory)
-        is_emergency = family == speed.family_index("emergency")
+        is_emergency = family == family_index("emergency")
         return Candidates(
             trajectory=trajectory,
             feasible=(inside | is_emergency) & allowed,
@@ -102,25 +217,324 @@ def speed_profiles(
 
     Reversing is replaced by standing still.
     """
-    stations = jnp.concatenate(
-        [
-            speed.constant_speed(scene),
-            speed.cruise(scene, config),
-            speed.stop(scene, config),
-            speed.follow(scene, config),
-            speed.overtake(scene, config),
-            speed.envelope(scene, config),
-            speed.emergency(scene, config),
-            speed.random_two_phase(key, scene, config),
-        ]
+    ego, times = scene.ego, jnp.asarray(TIMES_S)
+    random = _random_phases(key, scene, config)
+    cruising, ways = _cruise(scene, config), _to_states(scene, config)
+    # quartics: cruise and the first phases; quintics: stop, follow, overtake
+    speeds = jnp.concatenate([cruising[0], random.mid])
+    durations = jnp.concatenate([cruising[1], random.first])
+    to_speed = quartic(ego.s, ego.v, ego.a, speeds, 0.0, durations)
+    ends = jnp.maximum(ways[0], ego.s)
+    to_state = quintic(ego.s, ego.v, ego.a, ends, ways[1], 0.0, ways[2])
+    curves = jnp.concatenate([jnp.pad(to_speed, ((0, 0), (0, 1))), to_state])
+    durations = jnp.concatenate([durations, ways[2]])[:, None]
+    inside = jnp.minimum(times, durations)
+    value, speed, _, _ = evaluate(curves[:, None], inside)
+    rolled = value + jnp.maximum(speed, 0.0) * (times - inside)
+    count = cruising[0].size
+    first = slice(count, speeds.size)
+    stations = [
+        (ego.s + ego.v * times)[None],  # what a car does when nobody drives it
+        rolled[:count],
+        rolled[speeds.size :],
+        envelope(scene, config),
+        emergency(scene, config),
+        _second_phases(random, to_speed[first], value[first]),
+    ]
+    return running_max(jnp.concatenate(stations))
+
+
+def reachable_speeds(
+    scene: Scene, durations: Float[Array, " m"], config: SamplerConfig
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Lowest and highest end speed [M] m/s after each duration."""
+    v0 = scene.ego.v
+    limit = lookup(scene.path.speed_limit, scene.ego.s, STATION_STEP_M)
+    lowest = jnp.maximum(v0 - config.reach_braking * durations, 0.0)
+    highest = jnp.minimum(
+        v0 + config.reach_acceleration * durations,
+        jnp.maximum(config.limit_factor * limit, v0),
     )
-    return running_max(stations)
+    return lowest, highest
+
+
+def _at_level(
+    level: Float[Array, " m"],
+    v0: Float[Array, ""],
+    lowest: Float[Array, " m"],
+    highest: Float[Array, " m"],
+) -> Float[Array, " m"]:
+    """Speed at a signed share of the way from v0 to either bound."""
+    up, down = highest - v0, v0 - lowest
+    return v0 + jnp.where(level >= 0.0, level * up, level * down)
+
+
+def _cruise(
+    scene: Scene, config: SamplerConfig
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """End speeds m/s and durations s of the cruise quartics (Apollo lattice).
+
+    Their end acceleration is 0.
+    """
+    grid = np.array(
+        [(d, level) for d in config.cruise_times for level in config.cruise_levels],
+        np.float32,
+    )
+    durations, levels = jnp.asarray(grid[:, 0]), jnp.asarray(grid[:, 1])
+    lowest, highest = reachable_speeds(scene, durations, config)
+    return _at_level(levels, scene.ego.v, lowest, highest), durations
+
+
+def _to_states(
+    scene: Scene, config: SamplerConfig
+) -> tuple[Float[Array, " m"], Float[Array, " m"], Float[Array, " m"]]:
+    """End stations m, speeds m/s and durations s of stop, follow and overtake."""
+    parts = (_stop(scene, config), *_follow_and_overtake(scene, config))
+    stations, speeds, durations = zip(*parts, strict=True)
+    return (
+        jnp.concatenate(stations),
+        jnp.concatenate(speeds),
+        jnp.concatenate(durations),
+    )
+
+
+def _stop(scene: Scene, config: SamplerConfig) -> tuple[jax.Array, ...]:
+    """To a standstill: before the nearest line, or at a mean braking.
+
+    Without a line ahead the line's place is the comfortable stopping distance
+    v0^2 / (2 * 1.5), so that the number of profiles is fixed.
+    """
+    obstacles, ego = scene.obstacles, scene.ego
+    front = ego.s + 0.5 * ego.length
+    is_line = (obstacles.kind == Kind.STOP) | (obstacles.kind == Kind.VIRTUAL)
+    ahead = is_line[:, None] & obstacles.valid & (obstacles.s_lower >= front)
+    nearest_line = jnp.min(jnp.where(ahead, obstacles.s_lower, jnp.inf))
+    without = front + ego.v**2 / 3.0
+    line = jnp.where(jnp.isfinite(nearest_line), nearest_line, without)
+    lines = np.array(
+        [(d, gap) for d in config.stop_times for gap in config.stop_gaps], np.float32
+    )
+    brakings = jnp.asarray(config.stop_brakings, jnp.float32)
+    stations = (
+        line - 0.5 * ego.length - lines[:, 1],
+        ego.s + ego.v**2 / (2.0 * brakings),
+    )
+    durations = (lines[:, 0], jnp.clip(ego.v / brakings, 1.0, HORIZON_S))
+    stations = jnp.concatenate(stations)
+    return stations, jnp.zeros_like(stations), jnp.concatenate(durations)
+
+
+def _in_the_way(scene: Scene) -> jax.Array:
+    """Which obstacles [N, T] are in the way and not behind."""
+    obstacles, ego = scene.obstacles, scene.ego
+    lower, upper = obstacles.s_lower, obstacles.s_upper
+    at = jax.vmap(jax.vmap(lookup, (None, 0, None)), (None, 0, None))
+    path_l = at(scene.path.l, 0.5 * (lower + upper), STATION_STEP_M)
+    beside = jnp.maximum(obstacles.l_lower - path_l, path_l - obstacles.l_upper)
+    moves = (obstacles.kind < Kind.STOP) & (obstacles.kind != Kind.NONE)
+    in_way = beside < 0.5 * ego.width
+    return in_way & moves[:, None] & obstacles.valid & (upper > ego.s)
+
+
+def _follow_and_overtake(
+    scene: Scene, config: SamplerConfig
+) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
+    """To a headway behind the nearest in the way; to a clearance ahead of one.
+
+    Overtaken is the obstacle that is easiest to pass. Where nothing is in the way, the
+    edge is taken at the constant-speed station (plus 20 m), so that the number of
+    profiles is fixed.
+    """
+    ego = scene.ego
+    near = [int(np.argmin(np.abs(TIMES_S - time))) for time in config.edge_times]
+    at = TIMES_S[near]  # [E]
+    o = scene.obstacles
+    in_way = _in_the_way(scene).astype(jnp.float32)
+    facts = jnp.stack([in_way, o.s_lower, o.s_upper, o.speed])
+    facts = jnp.stack([facts[..., i] for i in near], axis=1)  # [4, E, N]
+    in_way, lower, upper, _ = facts
+    usable, coasting = in_way > 0.0, ego.s + ego.v * at  # [E, N], [E]
+
+    order = jnp.argsort(jnp.where(usable, lower, jnp.inf), axis=1)
+    order = order[:, : config.num_followed]
+    taken = jnp.take_along_axis(facts, order[None], axis=2)
+    found = taken[0] > 0.0
+    edge = jnp.where(found, taken[1], coasting[:, None] + 20.0)
+    pace = jnp.maximum(jnp.where(found, taken[3], ego.v), 0.0)
+    headways = jnp.asarray(config.follow_headways, jnp.float32)
+    gap = config.standstill_gap + headways * pace[..., None]
+    stations = edge[..., None] - gap - 0.5 * ego.length
+    spread = lambda x: jnp.broadcast_to(x, stations.shape).ravel()  # noqa: E731
+    follow = stations.ravel(), spread(pace[..., None]), spread(at[:, None, None])
+
+    effort = jnp.where(usable, jnp.abs(upper - coasting[:, None]), jnp.inf)
+    easiest = jnp.argmin(effort, axis=1)[:, None]
+    taken = jnp.take_along_axis(facts, easiest[None], axis=2)[..., 0]
+    edge = jnp.where(taken[0] > 0.0, taken[2], coasting)
+    pace = jnp.where(taken[0] > 0.0, taken[3], ego.v)
+    stations = edge + config.overtake_gap + 0.5 * ego.length
+    return follow, (stations, jnp.maximum(pace, 0.0), jnp.asarray(at))
+
+
+def speed_envelope(
+    scene: Scene, lateral: Float[Array, " m"], braking: Float[Array, " m"]
+) -> Float[Array, "m p"]:
+    """Highest speed m/s at each grid station from which all later caps are kept.
+
+        v(s)^2 = min over s' >= s of cap(s')^2 + 2 b (s' - s)
+        cap(s) = min(limit(s), sqrt(a_lat / |kappa(s)|))
+
+    One reverse running minimum of cap^2 + 2 b s for each (a_lat, b).
+    """
+    path = scene.path
+    bend = table_slope(table_slope(path.l, SLOPE_POINTS), SLOPE_POINTS)
+    kappa = jnp.maximum(jnp.abs(path.kappa + bend), 1e-5)
+    cap = jnp.minimum(path.speed_limit**2, lateral[:, None] / kappa)
+    stations = jnp.arange(path.l.shape[0]) * STATION_STEP_M
+    ramp = 2.0 * braking[:, None] * stations
+    lowest = remaining_min(cap + ramp)
+    return jnp.sqrt(jnp.maximum(lowest - ramp, 0.0))
+
+
+def envelope(scene: Scene, config: SamplerConfig) -> Float[Array, "m t"]:
+    """Driving up to the speed envelope: brisk, usual and calm, without a leader.
+
+    The quartics know one end speed and the limit at the ego; where limits and
+    bends change within the horizon none of them keeps up with the road. Here
+
+        a = min(a_max (1 - (v / u)^4), (u - v) / dt) below u, (u - v) / dt above,
+
+    u the envelope's lower value here and one step ahead; |a| and its change per
+    step are bounded.
+    """
+    grid = np.asarray(config.envelopes, np.float32)
+    share, top, braking, lateral = jnp.asarray(grid.T)
+    table = share[:, None] * speed_envelope(scene, lateral, braking)
+    at = jax.vmap(lookup, in_axes=(0, 0, None))
+    most = config.envelope_jerk * DT_S
+
+    def advance(state: tuple, _: None) -> tuple[tuple, jax.Array]:
+        s, v, a = state
+        ahead = at(table, s + v * DT_S, STATION_STEP_M)
+        ahead = jnp.minimum(ahead, at(table, s, STATION_STEP_M))
+        reach = (ahead - v) / DT_S
+        free = top * (1.0 - (v / jnp.maximum(ahead, 0.1)) ** 4)
+        wanted = jnp.where(v <= ahead, jnp.minimum(free, reach), reach)
+        wanted = jnp.clip(wanted, -config.reach_braking, top)
+        a = jnp.clip(wanted, a - most, a + most)
+        after = jnp.maximum(v + a * DT_S, 0.0)
+        s = s + 0.5 * (v + after) * DT_S
+        return (s, after, a), s
+
+    ego = scene.ego
+    start = tuple(jnp.full(share.shape, x) for x in (ego.s, ego.v, ego.a))
+    _, later = jax.lax.scan(advance, start, length=TIMES_S.size - 1)
+    return jnp.concatenate([start[0][None], later]).T
+
+
+def emergency(scene: Scene, config: SamplerConfig) -> Float[Array, "m t"]:
+    """s0 + v0 t - b t^2 / 2 until standing, for each emergency braking b."""
+    brakings = jnp.asarray(config.emergency_brakings, jnp.float32)[:, None]
+    times = jnp.minimum(jnp.asarray(TIMES_S)[None], scene.ego.v / brakings)
+    return scene.ego.s + scene.ego.v * times - 0.5 * brakings * times**2
+
+
+class _Phases(NamedTuple):
+    """Two speed changes in a row, as they are drawn; all [num_random]."""
+
+    mid: jax.Array  # m/s, speed after the first
+    end: jax.Array  # m/s, and after the second
+    first: jax.Array  # s, duration of the first
+    second: jax.Array  # s, and of the second
+
+
+def _random_phases(key: jax.Array, scene: Scene, config: SamplerConfig) -> _Phases:
+    """Random durations and end speeds. The key is consumed.
+
+    Levels are cubes of uniform draws, so that profiles crowd near the present
+    speed, where humans are.
+    """
+    shape = (2, config.num_random)
+    draws = jax.vmap(lambda k: jax.random.uniform(k, shape))(jax.random.split(key, 3))
+    between = lambda x, low, high: jnp.maximum(low, x * (high - low) + low)  # noqa: E731
+    first = between(draws[0, 0], MIN_PHASE_S, 5.0)
+    second = between(draws[1, 0], 1.5, 6.0)
+    levels = between(draws[2], -1.0, 1.0) ** 3
+    lowest, highest = reachable_speeds(scene, first, config)
+    mid = _at_level(levels[0], scene.ego.v, lowest, highest)
+    lowest, highest = reachable_speeds(scene, first + second, config)
+    end = jnp.clip(_at_level(levels[1], scene.ego.v, lowest, highest), lowest, highest)
+    return _Phases(mid, end, first, second)
+
+
+def _second_phases(
+    drawn: _Phases, curves: Float[Array, "m c"], early: Float[Array, "m t"]
+) -> Float[Array, "m t"]:
+    """Quartics from the first phases' ends, after their stations `early`."""
+    times, first, second = jnp.asarray(TIMES_S), drawn.first[:, None], drawn.second
+    joint = evaluate(curves, drawn.first)[0]
+    two = quartic(joint, drawn.mid, 0.0, drawn.end, 0.0, second)
+    later = jnp.clip(times - first, 0.0, second[:, None])
+    late = evaluate(two[:, None], later)[0]
+    rest = drawn.end[:, None] * jnp.maximum(times - first - second[:, None], 0.0)
+    return jnp.where(times <= first, early, late + rest)
+
+
+def num_lateral(config: SamplerConfig) -> int:
+    """Number of lateral profiles: hold, centre, two neighbours each time, nudges."""
+    return 1 + 3 * len(config.lateral_times) + len(config.nudge_offsets)
+
+
+def lateral_targets(
+    scene: Scene, config: SamplerConfig
+) -> tuple[Float[Array, " m"], Float[Array, " m"], Float[Array, " m"]]:
+    """Target offset [m], length of the move [m] and its validity per profile.
+
+    Profile 0 holds the offset of t = 0, profile 1 goes to the lane's centre;
+    the others are neighbouring lanes (valid inside the road's edges) and
+    nudges. A move takes `lateral_times` at the present speed.
+    """
+    ego, path = scene.ego, scene.path
+    left = lookup(path.lane_left, ego.s, STATION_STEP_M)
+    right = lookup(path.lane_right, ego.s, STATION_STEP_M)
+    centre, width = 0.5 * (left + right), left - right
+    road = (
+        lookup(path.road_right, ego.s, STATION_STEP_M) + 0.5 * ego.width,
+        lookup(path.road_left, ego.s, STATION_STEP_M) - 0.5 * ego.width,
+    )
+    targets, times = [ego.l], [max(config.lateral_times)]
+    for shift in (0.0, 1.0, -1.0):
+        for time in config.lateral_times:
+            targets.append(centre + shift * width)
+            times.append(time)
+    for offset in config.nudge_offsets:
+        targets.append(ego.l + offset)
+        times.append(max(config.lateral_times))
+    target = jnp.stack([jnp.asarray(value, jnp.float32) for value in targets])
+    lengths = jnp.asarray(times, jnp.float32) * ego.v
+    inside = (target >= road[0]) & (target <= road[1])
+    free = jnp.arange(target.size) < 1 + len(config.lateral_times)
+    return (
+        target,
+        jnp.maximum(lengths, config.min_lateral_length),
+        (inside | free).astype(jnp.float32),
+    )
+
+
+def lateral_offset(
+    scene: Scene, target: jax.Array, length: jax.Array, s: Float[Array, " t"]
+) -> Float[Array, " t"]:
+    """L [T] m along stations s: a quintic in s to the target, then constant."""
+    ego = scene.ego
+    curve = quintic(ego.l, ego.dl, ego.ddl, target, 0.0, 0.0, length)
+    way = jnp.clip(s - ego.s, 0.0, length)
+    return evaluate(curve[None], way)[0]
 
 
 def _with_lateral(
     scene: Scene, s: jax.Array, target: jax.Array, length: jax.Array
 ) -> Trajectory:
-    l = lateral.lateral_offset(scene, target, length, s)
+    l = lateral_offset(scene, target, length, s)
     return trajectory_from_positions(scene, s, l)
 
 
@@ -140,7 +554,7 @@ def within_limits(
         & (jnp.abs(kappa) <= config.max_curvature)
         & (jnp.abs(trajectory.v**2 * kappa) <= config.max_lateral_acceleration)
     )
-    counts = scene.time_valid.at[0].set(False)
+    counts = scene.time_valid & (np.arange(NUM_TIMES) > 0)
     return jnp.all(ok | ~counts)
 
 
@@ -177,5 +591,5 @@ def hard_negatives(
     return Candidates(
         trajectory=trajectory,
         feasible=jax.vmap(lambda x: within_limits(scene, x, config))(trajectory),
-        family=jnp.full((count,), speed.family_index("hard_negative"), jnp.int32),
+        family=jnp.full((count,), family_index("hard_negative"), jnp.int32),
     )

@@ -8,13 +8,18 @@ drive that ended in an at-fault collision fails every per-case column.
 """
 
 import dataclasses
+import functools
+from collections.abc import Sequence
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
 from rcirl_jax.simulation.cases import STEP_S, Record
-from rcirl_jax.simulation.filters import savitzky_golay
+
+FILTER_ORDER = 2  # of the polynomials of Savitzky-Golay filters
 
 COLUMNS = (
     "collision_free",
@@ -23,6 +28,11 @@ COLUMNS = (
     "a_lateral",
     "j_station",
     "j_lateral",
+)
+# fields of CaseMetrics that count
+COUNTED = (
+    *("samples", "collisions", "at_fault", "at_fault_vru", "at_fault_object"),
+    *("red_lights", "stop_signs", "brake_taps"),
 )
 
 
@@ -104,16 +114,42 @@ class CaseMetrics(flax.struct.PyTreeNode, kw_only=True):
     comfort: jax.Array  # 0 or 1
 
 
-def _masked(valid: jax.Array) -> tuple:
-    lowest = lambda x: jnp.min(jnp.where(valid, x, jnp.inf))  # noqa: E731
-    highest = lambda x: jnp.max(jnp.where(valid, x, -jnp.inf))  # noqa: E731
-    total = lambda x: jnp.sum(jnp.where(valid, x, 0))  # noqa: E731
-    return lowest, highest, total
-
-
 def differences(x: jax.Array) -> jax.Array:
     """Plain rate of change [S] per second at 10 Hz; the first sample has none."""
     return jnp.diff(x, prepend=x[:1]) / STEP_S
+
+
+@functools.cache
+def _least_squares(window: int, derivative: int) -> np.ndarray:
+    """Weights [window] of the least-squares parabola's derivative at the middle."""
+    x = np.arange(window) - window // 2
+    rows = np.linalg.pinv(np.vander(x, FILTER_ORDER + 1, increasing=True))
+    return rows[derivative] * np.prod(range(1, derivative + 1)) / STEP_S**derivative
+
+
+def savitzky_golay(
+    x: Float[Array, "n s"], filters: Sequence[tuple[int, int]]
+) -> Float[Array, "n f s"]:
+    """Smooth signals, or differentiate them by time; ends hold their values.
+
+    Savitzky-Golay filters (1964) of order 2 as one convolution. nuPlan judges comfort
+    through them: accelerations over 8 samples, jerks over 15. A window of 8 has no
+    middle sample; like scipy 1.11 and later, an even window is taken as the next odd
+    one.
+
+    Args:
+      x: [n, S] n signals, a sample every `STEP_S`.
+      filters: f pairs (window in samples, derivative 0 or 1).
+    """
+    longest = max(window | 1 for window, _ in filters)
+    kernels = np.zeros((len(filters), 1, longest))
+    for kernel, (window, derivative) in zip(kernels, filters, strict=True):
+        aside = (longest - (window | 1)) // 2
+        kernel[0, aside : longest - aside] = _least_squares(window | 1, derivative)
+    padded = jnp.pad(x, ((0, 0), (longest // 2, longest // 2)), mode="edge")
+    return jax.lax.conv_general_dilated(
+        padded[:, None], jnp.asarray(kernels, x.dtype), (1,), "VALID"
+    )
 
 
 def case_metrics(record: Record, config: MetricsConfig) -> CaseMetrics:
@@ -122,178 +158,192 @@ def case_metrics(record: Record, config: MetricsConfig) -> CaseMetrics:
         a_lateral = v^2 * curvature of the path driven, at the centre of gravity
         j = difference of consecutive samples / 0.1 s
 
+    What is summed over valid samples stands in one array, and so does what the largest
+    is taken of: a program compiles as long as it has loops.
+
     Args:
       record: leaves [S].
       config: thresholds; static.
     """
     valid = record.valid
-    lowest, highest, total = _masked(valid)
-    count = jnp.maximum(total(jnp.ones_like(record.v)), 1.0)
     a_lateral = record.v**2 * record.curvature
+    yaw_rate = record.v * record.curvature
     j, j_lateral = differences(record.a), differences(a_lateral)
-    window = config.jerk_window
-    smooth_j = savitzky_golay(record.a, window, derivative=1)
-    smooth_j_lateral = savitzky_golay(a_lateral, window, derivative=1)
-    fault = total(record.at_fault)
-    free = fault == 0
-    inside = jnp.stack(
-        [
-            record.at_fault == 0,
-            record.v < record.speed_limit + config.speed_slack,
-            jnp.abs(record.a) < config.max_acceleration,
-            jnp.abs(a_lateral) < config.max_acceleration,
-            jnp.abs(j) < config.max_jerk,
-            jnp.abs(j_lateral) < config.max_jerk,
-        ]
+    filtered = savitzky_golay(
+        jnp.stack([record.a, a_lateral, yaw_rate]),
+        (
+            (config.acceleration_window, 0),
+            (config.jerk_window, 0),
+            (config.jerk_window, 1),
+        ),
     )
-    smooth = jnp.stack(
-        [
-            jnp.abs(smooth_j) < config.max_jerk,
-            jnp.abs(smooth_j_lateral) < config.max_jerk,
-        ]
-    )
+    (smooth_a, _, smooth_j), (smooth_across, _, smooth_j_lateral) = filtered[:2]
+    yaw, yaw_a = filtered[2, 1], filtered[2, 2]
     ttc = jnp.where(record.ttc_counts, record.ttc, jnp.inf)
     below = jnp.maximum(config.ttc_threshold - ttc, 0.0)
+    over = jnp.maximum(record.v - record.speed_limit, 0.0)
+    second = round(1.0 / STEP_S)
+    backward = jnp.pad(record.s[:-second] - record.s[second:], (second, 0))
+    gentle = (
+        (smooth_a > config.min_longitudinal)
+        & (smooth_a < config.max_longitudinal)
+        & (jnp.abs(smooth_across) < config.max_lateral)
+        & (jnp.abs(smooth_j) < config.max_longitudinal_jerk)
+        & (jnp.hypot(smooth_j, smooth_j_lateral) < config.max_total_jerk)
+        & (jnp.abs(yaw) < config.max_yaw_rate)
+        & (jnp.abs(yaw_a) < config.max_yaw_acceleration)
+    )
+    bounds = [
+        record.at_fault == 0,
+        record.v < record.speed_limit + config.speed_slack,
+        jnp.abs(record.a) < config.max_acceleration,
+        jnp.abs(a_lateral) < config.max_acceleration,
+        jnp.abs(j) < config.max_jerk,
+        jnp.abs(j_lateral) < config.max_jerk,
+        jnp.abs(smooth_j) < config.max_jerk,
+        jnp.abs(smooth_j_lateral) < config.max_jerk,
+        ttc > config.nuplan_ttc,
+        gentle,
+    ]
+    slow = record.v < config.creeping_limit * record.speed_limit
+    start_time, turns = _starts_and_turns(record, config)
+    summed = {
+        "samples": jnp.ones_like(record.v),
+        "collisions": record.collision,
+        "at_fault": record.at_fault,
+        "at_fault_vru": record.at_fault_vru,
+        "at_fault_object": record.at_fault_object,
+        "red_lights": record.red_light,
+        "stop_signs": record.stop_sign,
+        "brake_taps": _brake_taps(record, config),
+        "v": record.v,
+        "standing": record.v < config.standing,
+        "creeping": slow & (record.free_way > config.creeping_way),
+        "tet": below > 0.0,
+        "tit": below,
+        "fallback": record.fallback,
+        "a2": record.a**2,
+        "j2": j**2,
+        "over": over,
+    }
+    rows = jnp.stack([x.astype(jnp.float32) for x in (*summed.values(), *bounds)])
+    sums = jnp.sum(jnp.where(valid, rows, 0.0), axis=1)
+    total = dict(zip(summed, sums, strict=False))
+    inside = sums[len(summed) :]
+    counted = {name: total[name].astype(jnp.int32) for name in COUNTED}
+    free = counted["at_fault"] == 0
+    holds = (inside == total["samples"]) & free
+    largest = {
+        "impact_speed": record.impact_speed,
+        "off_road": record.off_road,
+        "progress": record.s,
+        "induced_braking": record.induced_braking,
+        "max_a": record.a,
+        "max_a_lateral": jnp.abs(a_lateral),
+        "max_j": jnp.abs(j),
+        "max_j_lateral": jnp.abs(j_lateral),
+        "backward": backward,
+        "min_a": -record.a,
+        "min_ttc": -ttc,
+        "min_headway": -record.headway,
+        "min_clearance": -record.clearance,
+    }
+    rows = jnp.where(valid, jnp.stack(list(largest.values())), -jnp.inf)
+    top = dict(zip(largest, jnp.max(rows, axis=1), strict=True))
+    count = jnp.maximum(total["samples"], 1.0)
+    objects = counted["at_fault_object"]
+    others = counted["at_fault"] - objects
+    worst = top["backward"]
+    number = lambda x: x.astype(jnp.float32)  # noqa: E731
     return CaseMetrics(
-        samples=total(jnp.ones_like(record.collision)),
-        inside=jax.vmap(total)(inside.astype(jnp.int32)),
-        holds=jnp.all(inside | ~valid, axis=1) & free,
-        inside_filtered=jax.vmap(total)(smooth.astype(jnp.int32)),
-        holds_filtered=jnp.all(smooth | ~valid, axis=1) & free,
-        collisions=total(record.collision),
-        at_fault=fault,
-        at_fault_vru=total(record.at_fault_vru),
-        at_fault_object=total(record.at_fault_object),
-        impact_speed=jnp.maximum(highest(record.impact_speed), 0.0),
-        red_lights=total(record.red_light.astype(jnp.int32)),
-        stop_signs=total(record.stop_sign.astype(jnp.int32)),
-        off_road=jnp.maximum(highest(record.off_road), 0.0),
-        progress=jnp.maximum(highest(record.s), 0.0),
-        mean_speed=total(record.v) / count,
-        standing_share=total(record.v < config.standing) / count,
-        creeping_share=total(
-            (record.v < config.creeping_limit * record.speed_limit)
-            & (record.free_way > config.creeping_way)
-        )
-        / count,
-        start_time=_start_time(record, config),
-        sign_changes=_sign_changes(record, config) / (count * STEP_S),
-        min_ttc=lowest(ttc),
-        tet=total(below > 0.0) * STEP_S,
-        tit=total(below) * STEP_S,
-        min_headway=lowest(record.headway),
-        min_clearance=lowest(record.clearance),
-        induced_braking=jnp.maximum(highest(record.induced_braking), 0.0),
-        brake_taps=_brake_taps(record, config),
-        fallback_share=total(record.fallback) / count,
-        min_a=lowest(record.a),
-        max_a=highest(record.a),
-        rms_a=jnp.sqrt(total(record.a**2) / count),
-        max_a_lateral=highest(jnp.abs(a_lateral)),
-        max_j=highest(jnp.abs(j)),
-        rms_j=jnp.sqrt(total(j**2) / count),
-        max_j_lateral=highest(jnp.abs(j_lateral)),
-        **_nuplan(record, a_lateral, ttc, config),
+        **counted,
+        inside=inside[:6].astype(jnp.int32),
+        holds=holds[:6],
+        inside_filtered=inside[6:8].astype(jnp.int32),
+        holds_filtered=holds[6:8],
+        **{
+            name: jnp.maximum(top[name], 0.0)
+            for name in ("impact_speed", "off_road", "progress", "induced_braking")
+        },
+        mean_speed=total["v"] / count,
+        standing_share=total["standing"] / count,
+        creeping_share=total["creeping"] / count,
+        start_time=start_time,
+        sign_changes=turns / (count * STEP_S),
+        tet=total["tet"] * STEP_S,
+        tit=total["tit"] * STEP_S,
+        fallback_share=total["fallback"] / count,
+        rms_a=jnp.sqrt(total["a2"] / count),
+        rms_j=jnp.sqrt(total["j2"] / count),
+        **{
+            name: top[name]
+            for name in ("max_a", "max_a_lateral", "max_j", "max_j_lateral")
+        },
+        **{
+            name: -top[name]
+            for name in ("min_a", "min_ttc", "min_headway", "min_clearance")
+        },
+        no_fault=jnp.where(others > 0, 0.0, jnp.maximum(1.0 - 0.5 * objects, 0.0)),
+        drivable=number(top["off_road"] < config.nuplan_off_road),
+        direction=jnp.where(worst < 2.0, 1.0, jnp.where(worst <= 6.0, 0.5, 0.0)),
+        ttc_bound=number(holds[8]),
+        speed_compliance=jnp.maximum(
+            1.0 - total["over"] / (config.nuplan_overspeed * count), 0.0
+        ),
+        comfort=number(holds[9]),
     )
 
 
-def _start_time(record: Record, config: MetricsConfig) -> jax.Array:
-    """Longest time [s] from standstill to 80 % of the posted limit, the road free.
+def _starts_and_turns(
+    record: Record, config: MetricsConfig
+) -> tuple[jax.Array, jax.Array]:
+    """Longest start [s] on a free road, -1 if none; and how often a turns its sign.
 
     A start begins at the first sample at which the ego stands, or that the drive
     begins with below 1 m/s, and from which on the road is free as for
-    `creeping_share`; it ends where the speed is reached, or else with the record. One
-    in which the road is free no longer does not count. -1: no start that counts.
+    `creeping_share`; it ends where 80 % of the posted limit is reached, or else with
+    the record. One in which the road is free no longer does not count.
+
+    The acceleration turns where, beyond the band, it has another sign than when it was
+    last beyond it.
     """
     is_free = record.free_way > config.creeping_way
     reached = record.v >= config.started * record.speed_limit
     first = jnp.arange(record.v.size) == 0
     begins = (record.v < config.standing) | (first & (record.v < config.starting))
+    sign = jnp.sign(record.a) * (jnp.abs(record.a) > config.turning_band)
+    sign = jnp.where(record.valid, sign, 0.0)
 
-    def follow(
-        carry: tuple[jax.Array, jax.Array], now: tuple[jax.Array, ...]
-    ) -> tuple[tuple[jax.Array, jax.Array], None]:
-        since, longest = carry  # samples since the start began; -1: in none
-        valid, free, there, stands = now
+    def follow(carry: tuple, now: tuple) -> tuple[tuple, None]:
+        since, longest, last, turns = (
+            carry  # samples since the start began; -1: in none
+        )
+        valid, free, there, stands, push = now
         lasts = jnp.where(since >= 0, since + 1, jnp.where(stands, 0, -1))
         is_over = valid & there & (since >= 0)
         longest = jnp.where(is_over, jnp.maximum(longest, lasts), longest)
         lasts = jnp.where(free & ~there, lasts, -1)
-        return (jnp.where(valid, lasts, since), longest), None
+        since = jnp.where(valid, lasts, since)
+        turns = turns + (push * last < 0.0)
+        return (since, longest, jnp.where(push != 0.0, push, last), turns), None
 
     none = jnp.full_like(record.collision[0], -1)
-    samples = (record.valid, is_free, reached, begins)
-    (since, longest), _ = jax.lax.scan(follow, (none, none), samples)
+    begin = (none, none, jnp.zeros_like(sign[0]), none + 1)
+    samples = (record.valid, is_free, reached, begins, sign)
+    (since, longest, _, turns), _ = jax.lax.scan(follow, begin, samples)
     found = jnp.maximum(since, longest)  # a start may last to the record's end
-    return jnp.where(found < 0, -1.0, found * STEP_S)
-
-
-def _sign_changes(record: Record, config: MetricsConfig) -> jax.Array:
-    """How often a, where beyond the band, has another sign than when last beyond it."""
-    sign = jnp.sign(record.a) * (jnp.abs(record.a) > config.turning_band)
-    sign = jnp.where(record.valid, sign, 0.0)
-
-    def last(before: jax.Array, now: jax.Array) -> tuple[jax.Array, jax.Array]:
-        turned = (now * before) < 0.0
-        return jnp.where(now != 0.0, now, before), turned
-
-    _, turned = jax.lax.scan(last, jnp.zeros_like(sign[0]), sign)
-    return jnp.sum(turned)
+    return jnp.where(found < 0, -1.0, found * STEP_S), turns
 
 
 def _brake_taps(record: Record, config: MetricsConfig) -> jax.Array:
-    """How often the acceleration turns by more than 1 m/s^2 through 0 within 2 s."""
+    """Samples [S] at which a turns by more than 1 m/s^2 through 0 within 2 s."""
     back = round(config.tap_window_s / STEP_S)
     a = record.a
     recent = jax.lax.reduce_window(
         a, -jnp.inf, jax.lax.max, (back,), (1,), [(back - 1, 0)]
     )
     braking = (a < 0.0) & (recent > 0.0) & (recent - a > config.tap_change)
-    begins = braking & ~jnp.concatenate([jnp.zeros((1,), bool), braking[:-1]])
-    return jnp.sum(begins & record.valid, dtype=jnp.int32)
-
-
-def _nuplan(
-    record: Record, a_lateral: jax.Array, ttc: jax.Array, config: MetricsConfig
-) -> dict[str, jax.Array]:
-    valid = record.valid
-    _, highest, total = _masked(valid)
-    objects = total(record.at_fault_object)
-    others = total(record.at_fault) - objects
-    no_fault = jnp.where(others > 0, 0.0, jnp.maximum(1.0 - 0.5 * objects, 0.0))
-    over = jnp.maximum(record.v - record.speed_limit, 0.0)
-    duration = jnp.maximum(total(jnp.ones_like(over)), 1.0)
-    loss = total(over) / (config.nuplan_overspeed * duration)
-    second = round(1.0 / STEP_S)
-    backward = -(record.s - jnp.roll(record.s, second))
-    backward = jnp.where(jnp.arange(backward.size) < second, 0.0, backward)
-    worst = highest(backward)
-    a = savitzky_golay(record.a, config.acceleration_window)
-    across = savitzky_golay(a_lateral, config.acceleration_window)
-    j = savitzky_golay(record.a, config.jerk_window, derivative=1)
-    j_across = savitzky_golay(a_lateral, config.jerk_window, derivative=1)
-    yaw_rate = record.v * record.curvature
-    yaw = savitzky_golay(yaw_rate, config.jerk_window)
-    yaw_a = savitzky_golay(yaw_rate, config.jerk_window, derivative=1)
-    gentle = (
-        (a > config.min_longitudinal)
-        & (a < config.max_longitudinal)
-        & (jnp.abs(across) < config.max_lateral)
-        & (jnp.abs(j) < config.max_longitudinal_jerk)
-        & (jnp.hypot(j, j_across) < config.max_total_jerk)
-        & (jnp.abs(yaw) < config.max_yaw_rate)
-        & (jnp.abs(yaw_a) < config.max_yaw_acceleration)
-    )
-    number = lambda x: x.astype(jnp.float32)  # noqa: E731
-    free = total(record.at_fault) == 0
-    return {
-        "no_fault": no_fault,
-        "drivable": number(highest(record.off_road) < config.nuplan_off_road),
-        "direction": jnp.where(worst < 2.0, 1.0, jnp.where(worst <= 6.0, 0.5, 0.0)),
-        "ttc_bound": number(jnp.all((ttc > config.nuplan_ttc) | ~valid) & free),
-        "speed_compliance": jnp.maximum(1.0 - loss, 0.0),
-        "comfort": number(jnp.all(gentle | ~valid) & free),
-    }
+    return braking & ~jnp.concatenate([jnp.zeros((1,), bool), braking[:-1]])
 
 
 def nuplan_score(

@@ -15,7 +15,7 @@ from rcirl_jax.sampling import (
     trajectory_from_positions,
     trajectory_on_path,
 )
-from rcirl_jax.sampling.speed import family_index
+from rcirl_jax.sampling.sampler import family_index
 from rcirl_jax.train.facts import admitted, densities, facts_of
 from rcirl_jax.train.state import Batch, Facts, FeatureBatch, TrainConfig
 from rcirl_jax.types import Candidates, Demonstration, Scene, Trajectory

@@ -17,7 +17,7 @@ from rcirl_jax.sampling import (
     sample,
     trajectory_on_path,
 )
-from rcirl_jax.sampling.speed import speed_envelope
+from rcirl_jax.sampling.sampler import speed_envelope
 from rcirl_jax.types import Kind
 from rcirl_jax.units import STATION_STEP_M, TIMES_S
 from tests.helpers.scenes import batch, random_scene, scene

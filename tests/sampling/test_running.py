@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.geometry.running import remaining_min, running_max
+from rcirl_jax.sampling.kinematics import remaining_min, running_max
 
 
 @pytest.mark.parametrize("shape", [(1,), (2,), (18,), (3, 5), (4, 128)])
