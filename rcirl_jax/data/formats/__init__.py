@@ -17,7 +17,7 @@ from rcirl_jax.data.formats.declared import with_numbers_and_texts
 from rcirl_jax.data.formats.files import log_name, with_log_names
 from rcirl_jax.data.formats.format import Format
 from rcirl_jax.data.formats.options import STATED, check_options
-from rcirl_jax.data.readers.tables.ledger import NoRowsError
+from rcirl_jax.data.readers.tables.rows import NoRowsError
 from rcirl_jax.data.readers.tables.streams import refuse_pointer
 from rcirl_jax.data.recording import empty_recording
 from rcirl_jax.errors import InputError, as_input_error

@@ -9,15 +9,14 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rcirl_jax.data.formats.options import section
-from rcirl_jax.data.readers.tables.ledger import Ledger, allowed_share
-from rcirl_jax.data.readers.tables.repair import once
+from rcirl_jax.data.readers.tables.rows import (
+    Rows,
+    RowStats,
+    allowed_share,
+    drop_duplicates,
+)
 from rcirl_jax.data.readers.tables.table import (
-    MAX_PLACE_M,
-    MAX_TIME,
-    MAX_VELOCITY_MPS,
     Field,
     Table,
     fields_of,
@@ -26,7 +25,6 @@ from rcirl_jax.data.readers.tables.table import (
 )
 from rcirl_jax.types import Kind
 
-Rows = dict[str, np.ndarray]  # field -> [n]
 KINDS = {
     **dict.fromkeys(("pedestrian", "person", "animal"), Kind.PEDESTRIAN),
     # a trailer is in the way of others like any body that moves, but nobody drives it:
@@ -35,10 +33,6 @@ KINDS = {
     **dict.fromkeys(("car", "van", "truck", "bus", "truck_bus"), Kind.VEHICLE),
     **dict.fromkeys(("motorcycle", "vehicle"), Kind.VEHICLE),
 }  # class of a road user, in small letters -> what it is; others are vehicles
-LIMITS = {
-    **{"time": MAX_TIME, "place": MAX_PLACE_M, "speed": MAX_VELOCITY_MPS},
-    **{"count": 1e12, "number": np.inf, "text": np.inf},
-}
 
 
 def with_numbers_and_texts(spec: dict, packaged: Mapping) -> dict:
@@ -47,10 +41,10 @@ def with_numbers_and_texts(spec: dict, packaged: Mapping) -> dict:
     return {k: v for k, v in packaged.items() if isinstance(v, plain)} | spec
 
 
-def open_log(path: Path, spec: Mapping) -> tuple[Table, Ledger]:
+def open_log(path: Path, spec: Mapping) -> tuple[Table, RowStats]:
     """A table as its source TOML says, and what will become of its rows."""
     table = open_table(path, section(spec, "table"))
-    return table, Ledger(path=path, unit=table.unit, allowed=allowed_share(spec))
+    return table, RowStats(path=path, unit=table.unit, allowed=allowed_share(spec))
 
 
 def unknown_kinds(what: str, found: Iterable[str]) -> list[str]:
@@ -75,24 +69,27 @@ class Columns:
 
     def fields(self, table: Table) -> list[Field]:
         """Fields of a table: those needed, and others whose column is there."""
-        kinds = {**self.needed, **self.optional}
         return fields_of(
             table,
-            [*self.needed],
-            [*self.optional],
-            texts=[name for name, kind in kinds.items() if kind == "text"],
-            limits={name: LIMITS[kind] for name, kind in kinds.items()},
+            self.needed,
+            self.optional,
             columns=self.called,
             factors=self.factors,
         )
 
-    def read(self, table: Table, ledger: Ledger) -> Rows:
+    def read(self, table: Table, stats: RowStats) -> Rows:
         """Rows in SI units, each road user once in a frame.
 
         Args:
           table: of `open_log`.
-          ledger: of it, which counts what is dropped.
+          stats: of it, which counts what is dropped.
         """
-        rows = read(table, self.fields(table), ledger)
-        options = {"places": self.places, "name_of": self.name_of}
-        return once(rows, ledger, self.t, self.user, **options)
+        rows = read(table, self.fields(table), stats)
+        return drop_duplicates(
+            rows,
+            stats,
+            t=self.t,
+            user=self.user,
+            places=self.places,
+            name_of=self.name_of,
+        )

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.readers.tables.repair import is_far
+from rcirl_jax.data.readers.tables.rows import is_far
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Track
 

@@ -169,15 +169,15 @@ from rcirl_jax.data.inputs import InputFile
 from rcirl_jax.data.formats import parts
 from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.readers.tables import streams
-from rcirl_jax.data.readers.tables.ledger import Ledger
+from rcirl_jax.data.readers.tables.rows import RowStats
 from rcirl_jax.data.readers.tables.table import fields_of, open_table
 # what is held is reached in the shorter log already
-streams.READ_BYTES, long_logs.BUFFER_BYTES = 2**18, 2**20
+streams.READ_CHARS, long_logs.BUFFER_BYTES = 2**18, 2**20
 path = Path(sys.argv[1])
-table, ledger = open_table(path), Ledger(path=path)
-fields = fields_of(table, ("t", "id", "x", "y"), texts=("id",))
-with long_logs.rows_of(table, fields, ledger, is_long=True) as spill:
-    rows = sum(len(piece.values["t"]) for piece in spill.pieces(None, 0.55))
+table, stats = open_table(path), RowStats(path=path)
+fields = fields_of(table, {"t": "time", "id": "text", "x": "place", "y": "place"})
+with long_logs.rows_of(table, fields, stats, is_long=True) as spill:
+    rows = sum(len(piece.values["t"]) for piece in spill.slices(None, 0.55))
 print(rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
 

@@ -21,7 +21,7 @@ from rcirl_jax.data.formats.levelx import map as levelx_lanes
 from rcirl_jax.data.formats.nuplan import map as nuplan_map
 from rcirl_jax.data.readers.sqlite import Database
 from rcirl_jax.data.readers.tables import table
-from rcirl_jax.data.readers.tables.ledger import Ledger
+from rcirl_jax.data.readers.tables.rows import RowStats
 from rcirl_jax.data.readers.xml import read_xml
 from rcirl_jax.evaluation.closed_loop.runs import read_runs
 from rcirl_jax.runtime.specs import load_toml
@@ -283,7 +283,8 @@ def test_row_groups_that_claim_too_much(tmp_path, monkeypatch, name, words):
 
     def numbers():
         opened = table.open_table(file)
-        return table.read(opened, table.fields_of(opened, ["a"]), Ledger(path=file))
+        fields = table.fields_of(opened, {"a": "number"})
+        return table.read(opened, fields, RowStats(path=file))
 
     np.testing.assert_array_equal(numbers()["a"], np.arange(100.0))
     monkeypatch.setattr(f"rcirl_jax.data.readers.tables.columnar.{name}", 10)

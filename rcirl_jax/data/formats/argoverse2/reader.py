@@ -46,7 +46,7 @@ from rcirl_jax.data.formats.shapes import (
     origin_notes,
 )
 from rcirl_jax.data.formats.tracks import once_each, split_tracks
-from rcirl_jax.data.readers.tables.ledger import Ledger
+from rcirl_jax.data.readers.tables.rows import RowStats
 from rcirl_jax.data.readers.tables.table import fields_of, open_table, read
 from rcirl_jax.data.recording import MAX_SPEED_MPS, validate_recording
 from rcirl_jax.errors import InputError
@@ -127,8 +127,9 @@ def _read_rows(file: Path) -> dict[str, np.ndarray]:
         raise InputError(f"{file}: parquet: text: expected Parquet")
     needed = [name for name in (*NUMBERS, *TEXT) if name not in OPTIONAL]
     needed += [name for name in OPTIONAL if name in source.header]
-    ledger = Ledger(path=file, unit=source.unit, allowed=0.0)
-    return read(source, fields_of(source, needed, texts=TEXT), ledger)
+    kinds = {name: "text" if name in TEXT else "number" for name in needed}
+    stats = RowStats(path=file, unit=source.unit, allowed=0.0)
+    return read(source, fields_of(source, kinds), stats)
 
 
 def _constant(file: Path, table: dict[str, np.ndarray], field: str) -> str:

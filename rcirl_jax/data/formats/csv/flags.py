@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from rcirl_jax.data.readers.tables.layout import NUMBER
+from rcirl_jax.data.readers.tables.text import NUMBER
 from rcirl_jax.errors import InputError
 
 YES = (

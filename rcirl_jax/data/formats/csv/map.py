@@ -9,14 +9,17 @@ import numpy as np
 from rcirl_jax.data.formats.lanes import StraightLane, straight_lanes
 from rcirl_jax.data.formats.options import number, path_option, stated
 from rcirl_jax.data.formats.paths import path_lanes
-from rcirl_jax.data.readers.tables.ledger import Ledger
+from rcirl_jax.data.readers.tables.rows import RowStats
 from rcirl_jax.data.readers.tables.table import fields_of, open_table, read
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane, Track
 
 MARGIN_M = 50.0  # m of fitted lane beyond the first and last position
-LANE_COLUMNS = ("id", "x", "y")
-LANE_OPTIONAL = ("width", "speed_limit", "left", "right", "successor")
+LANE_COLUMNS = {"id": "text", "x": "number", "y": "number"}
+LANE_OPTIONAL = {
+    **{"width": "number", "speed_limit": "number"},
+    **{"left": "text", "right": "text", "successor": "text"},
+}
 LIMIT_MPS = 29.06  # m/s, 65 mph
 LANE_WIDTH_M = 3.5  # m
 
@@ -70,9 +73,9 @@ def _lanes_from_file(path: Path, name: str) -> list[dict]:
         raise InputError(
             f"{path}: lanes.file: {name}: expected this CSV beside the log"
         )
-    opened, texts = open_table(table_path), ("id", "left", "right", "successor")
-    fields = fields_of(opened, LANE_COLUMNS, LANE_OPTIONAL, texts=texts)
-    table = read(opened, fields, Ledger(path=table_path, allowed=0.0))
+    opened = open_table(table_path)
+    fields = fields_of(opened, LANE_COLUMNS, LANE_OPTIONAL)
+    table = read(opened, fields, RowStats(path=table_path, allowed=0.0))
     lanes = []
     for lane in dict.fromkeys(table["id"].tolist()):
         rows = np.flatnonzero(table["id"] == lane)

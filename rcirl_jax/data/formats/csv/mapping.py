@@ -22,7 +22,6 @@ from rcirl_jax.data.formats.options import (
     section,
 )
 from rcirl_jax.data.readers.tables.cells import EMPTY, ISO
-from rcirl_jax.data.readers.tables.layout import NUMBER
 from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
     MAX_TIME,
@@ -30,6 +29,7 @@ from rcirl_jax.data.readers.tables.table import (
     Field,
     Table,
 )
+from rcirl_jax.data.readers.tables.text import NUMBER
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.checked import check_names
 

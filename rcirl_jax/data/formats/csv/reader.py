@@ -33,8 +33,8 @@ from rcirl_jax.data.formats.options import number, patterns
 from rcirl_jax.data.formats.projection import projected
 from rcirl_jax.data.formats.shapes import local_origin, origin_notes
 from rcirl_jax.data.formats.tracks import split_tracks
-from rcirl_jax.data.readers.long_logs import piece_of, rows_of
-from rcirl_jax.data.readers.tables.ledger import Ledger, with_news
+from rcirl_jax.data.readers.long_logs import rows_of
+from rcirl_jax.data.readers.tables.rows import RowStats, attach_row_stats
 from rcirl_jax.data.readers.tables.table import Table
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
@@ -55,7 +55,7 @@ class Log:
     table: Table
     spec: dict
     mapping: Mapping
-    ledger: Ledger
+    stats: RowStats
 
     @property
     def path(self) -> Path:
@@ -115,13 +115,13 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     for file in parts(path, spec):
         log = opened(file, spec)
         for made in _recordings(log, is_long_file(file, spec)):
-            yield validate_recording(with_news(made, log.ledger), file)
+            yield validate_recording(attach_row_stats(made, log.stats), file)
 
 
 def opened(file: Path, spec: dict) -> Log:
     """A file with its mapping, none of whose rows is read."""
-    table, ledger = open_log(file, spec)
-    return Log(table=table, spec=spec, mapping=mapping_of(table, spec), ledger=ledger)
+    table, stats = open_log(file, spec)
+    return Log(table=table, spec=spec, mapping=mapping_of(table, spec), stats=stats)
 
 
 def _recordings(log: Log, is_long: bool) -> Iterator[Recording]:
@@ -129,7 +129,7 @@ def _recordings(log: Log, is_long: bool) -> Iterator[Recording]:
     with rows_of(
         log.table,
         fields,
-        log.ledger,
+        log.stats,
         is_long=is_long,
         distance=log.mapping.distance,
         is_clock=log.mapping.is_clock,
@@ -140,10 +140,10 @@ def _recordings(log: Log, is_long: bool) -> Iterator[Recording]:
         meaning = meaning_of(log.path, minutes, automated, log.mapping, log.spec)
         for recording in every:
             name = log.name if recording is None else f"{log.name}-{recording}"
-            for piece in rows.pieces(recording, gap_s):
+            for piece in rows.slices(recording, gap_s):
                 table = _localise(log, log.placed(piece.values), meaning)
                 made = _recording(f"{name}{piece.label}", table, log, meaning)
-                yield piece_of(name, made, piece)
+                yield piece.of_log(name, made)
 
 
 def _localise(log: Log, values: dict[str, np.ndarray], meaning: Meaning) -> LogTable:

@@ -39,9 +39,9 @@ from rcirl_jax.data.formats.csv.suggestion import (
     unknown,
 )
 from rcirl_jax.data.formats.options import KINDS, UNITS
-from rcirl_jax.data.readers.tables.layout import NUMBER
-from rcirl_jax.data.readers.tables.ledger import LINE
+from rcirl_jax.data.readers.tables.rows import LINE
 from rcirl_jax.data.readers.tables.table import MAX_TIME, Table, batches, open_table
+from rcirl_jax.data.readers.tables.text import NUMBER
 from rcirl_jax.errors import InputError, as_input_error
 
 USUAL_RATES = (1, 2, 4, 5, 10, 12.5, 15, 20, 24, 25, 29.97, 30, 50, 60, 100, 120)
@@ -139,7 +139,7 @@ def _wide(table: Table) -> dict[str, str]:
 def _first_rows(path: Path, spec: AnyMapping) -> dict[str, np.ndarray]:
     """Rows of the first MiB as a source TOML takes them, texts as text."""
     log = opened(path, dict(spec))
-    for batch in batches(log.table, log.mapping.fields, log.ledger):
+    for batch in batches(log.table, log.mapping.fields, log.stats):
         rows = {
             name: np.array(column[1])[column[0]]
             if isinstance(column, tuple)
@@ -148,7 +148,7 @@ def _first_rows(path: Path, spec: AnyMapping) -> dict[str, np.ndarray]:
         }
         if rows[LINE].size:
             return rows
-    log.ledger.check()
+    log.stats.check()
     raise InputError(f"{path}: rows: none: expected rows below the header")
 
 

@@ -16,7 +16,7 @@ from rcirl_jax.data.formats.csv.mapping import HOLE, Mapping
 from rcirl_jax.data.formats.csv.meaning import Meaning
 from rcirl_jax.data.formats.csv.reader import PATTERNS
 from rcirl_jax.data.formats.files import table_stem
-from rcirl_jax.data.readers.tables.ledger import LINE
+from rcirl_jax.data.readers.tables.rows import LINE
 from rcirl_jax.data.readers.tables.table import Table
 
 ROWS_SHOWN = 5

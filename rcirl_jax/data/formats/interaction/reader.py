@@ -40,8 +40,13 @@ from rcirl_jax.data.formats.paths import path_lanes
 from rcirl_jax.data.formats.perception import SIZES_M
 from rcirl_jax.data.formats.projection import utm, utm_zone
 from rcirl_jax.data.formats.tracks import split_tracks, travel_heading
-from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, NoRowsError, with_news
-from rcirl_jax.data.readers.tables.repair import once
+from rcirl_jax.data.readers.tables.rows import (
+    LINE,
+    NoRowsError,
+    RowStats,
+    attach_row_stats,
+    drop_duplicates,
+)
 from rcirl_jax.data.readers.tables.table import open_table, read
 from rcirl_jax.data.recording import accepted, validate_recording
 from rcirl_jax.errors import InputError
@@ -81,24 +86,24 @@ class _Scene:
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per vehicle file, or per case of a challenge file."""
     for file in parts(path, spec):
-        rows, ledger = _read(file, spec)
-        scene, ledgers = _scene(file, spec), [ledger]
+        rows, stats = _read(file, spec)
+        scene, all_stats = _scene(file, spec), [stats]
         if np.isfinite(rows["case_id"]).any():
             for made in _cases(rows, scene):
-                yield with_news(made, ledger)
+                yield attach_row_stats(made, stats)
             continue
         partner = file.with_name(file.name.replace(VEHICLES, PEDESTRIANS, 1))
         if partner != file and partner.is_file():
             with contextlib.suppress(NoRowsError):  # no pedestrians
-                others, ledger = _read(partner, spec)
+                others, stats = _read(partner, spec)
                 rows = {k: np.concatenate([rows[k], others[k]]) for k in rows}
-                ledgers.append(ledger)
+                all_stats.append(stats)
         own = own_name(file)
         name = log_name(file, spec, own)
         # logs of one name may be copies of each other
         group = None if name == own else own
         made = _recording(name, rows, scene, group)
-        yield validate_recording(with_news(made, *ledgers), file)
+        yield validate_recording(attach_row_stats(made, *all_stats), file)
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
@@ -148,13 +153,13 @@ def _scene_name(path: Path) -> str:
     )
 
 
-def _read(path: Path, spec: dict) -> tuple[Rows, Ledger]:
+def _read(path: Path, spec: dict) -> tuple[Rows, RowStats]:
     """All columns this module uses, and what became of the rows.
 
     NaN where a file or a cell has none; a road user is one of a case.
     """
-    table, ledger = open_log(path, spec)
-    rows = read(table, TABLE.fields(table), ledger)
+    table, stats = open_log(path, spec)
+    rows = read(table, TABLE.fields(table), stats)
     rows = dict.fromkeys(TABLE.optional, np.full(rows[LINE].size, np.nan)) | rows
     unknown = ~np.isfinite(rows["case_id"])
     if table.has("case_id") and unknown.any():
@@ -167,7 +172,8 @@ def _read(path: Path, spec: dict) -> tuple[Rows, Ledger]:
     def name_of(user: float) -> str:
         return str(users[int(user) % users.size])
 
-    return once(rows, ledger, TABLE.t, "user", name_of=name_of), ledger
+    rows = drop_duplicates(rows, stats, t=TABLE.t, user="user", name_of=name_of)
+    return rows, stats
 
 
 def _scene(path: Path, spec: dict) -> _Scene:

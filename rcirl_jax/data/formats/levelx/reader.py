@@ -33,7 +33,7 @@ from rcirl_jax.data.formats.options import number
 from rcirl_jax.data.formats.paths import path_lanes
 from rcirl_jax.data.formats.projection import utm, utm_zone
 from rcirl_jax.data.formats.tracks import split_tracks, travel_heading
-from rcirl_jax.data.readers.tables.ledger import Ledger, with_news
+from rcirl_jax.data.readers.tables.rows import RowStats, attach_row_stats
 from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
     Table,
@@ -137,9 +137,9 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     for file in parts(path, spec):
         if not file.name.endswith(SUFFIX):
             raise InputError(f"{file}: name: {file.name}: expected XX{SUFFIX}")
-        table, ledger = open_log(file, spec)
-        made = _recording(table, spec, ledger)
-        yield validate_recording(with_news(made, ledger), file)
+        table, stats = open_log(file, spec)
+        made = _recording(table, spec, stats)
+        yield validate_recording(attach_row_stats(made, stats), file)
 
 
 def _other(path: Path, suffix: str) -> Path:
@@ -167,11 +167,11 @@ def _read_meta(path: Path) -> _Meta:
     return _Meta(path=path, cells=dict(zip(table.header, texts, strict=True)))
 
 
-def _recording(table: Table, spec: dict, ledger: Ledger) -> Recording:
+def _recording(table: Table, spec: dict, stats: RowStats) -> Recording:
     """Boxes by their corners (highD), or by their centres (inD and its sisters)."""
     path, is_corner = table.path, "xCenter" not in table.header
     columns = CORNER if is_corner else CENTRE
-    rows = columns.read(table, ledger)
+    rows = columns.read(table, stats)
     direction = "drivingDirection" if is_corner else None
     users = _read_users(_beside(path, USERS), columns.called.get("id", "id"), direction)
     meta = _read_meta(_beside(path, META))
@@ -241,10 +241,11 @@ def _track(name: str, rows: Rows, user: _User, spec: dict) -> Track:
 def _read_users(path: Path, key: str, direction: str | None) -> dict[int, _User]:
     """Track number -> what tracksMeta says of it."""
     rows, *ends = LIFE
-    wanted = [key, "class", *ends, *([direction] if direction else [])]
+    wanted = {key: "number", "class": "text", **dict.fromkeys(ends, "number")}
+    wanted |= {direction: "number"} if direction else {}
     source = open_table(path)
-    fields = fields_of(source, wanted, (rows,), texts=("class",))
-    table = read(source, fields, Ledger(path=path, allowed=0.0))
+    fields = fields_of(source, wanted, {rows: "number"})
+    table = read(source, fields, RowStats(path=path, allowed=0.0))
     first, last = (table[end] for end in ends)
     lives = zip(table.get(rows, last - first + 1.0), first, last, strict=True)
     towards = table[direction] if direction else np.zeros(table[key].size)

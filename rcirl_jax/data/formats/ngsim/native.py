@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from rcirl_jax.data.readers.tables.layout import BLANKS
 from rcirl_jax.data.readers.tables.table import Table
+from rcirl_jax.data.readers.tables.text import BLANKS
 
 COLUMNS = 18
 

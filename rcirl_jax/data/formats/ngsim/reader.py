@@ -37,10 +37,10 @@ from rcirl_jax.data.formats.ngsim.map import (
     site_recording,
 )
 from rcirl_jax.data.formats.options import patterns, positive, section, unit_factor
-from rcirl_jax.data.readers.long_logs import piece_of, rows_of
-from rcirl_jax.data.readers.tables.layout import BLANKS
-from rcirl_jax.data.readers.tables.ledger import Ledger, with_news
+from rcirl_jax.data.readers.long_logs import rows_of
+from rcirl_jax.data.readers.tables.rows import RowStats, attach_row_stats
 from rcirl_jax.data.readers.tables.table import Field, Table, batches
+from rcirl_jax.data.readers.tables.text import BLANKS
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording
@@ -87,22 +87,22 @@ own_name = table_stem  # of a log, as long as no other folder has one called ali
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per file and site; of a long file, per site and minute."""
     for file in parts(path, spec):
-        table, ledger = _open(file, spec)
-        ledger.repeats_are_bad = False  # the portal's files hold some
-        for made in _recordings(table, spec, ledger):
-            yield validate_recording(with_news(made, ledger), file)
+        table, stats = _open(file, spec)
+        stats.repeats_are_bad = False  # the portal's files hold some
+        for made in _recordings(table, spec, stats):
+            yield validate_recording(attach_row_stats(made, stats), file)
 
 
-def _recordings(table: Table, spec: dict, ledger: Ledger) -> Iterator[Recording]:
+def _recordings(table: Table, spec: dict, stats: RowStats) -> Iterator[Recording]:
     """Lanes and notes are those of a whole site, also of its minutes."""
     path, frame_s = table.path, positive(spec, "frame_s")
     stamped = _has_stamps(table)
     with rows_of(
         table,
         _fields(table, spec, stamped),
-        ledger,
+        stats,
         is_long=is_long_file(path, spec),
-        apart=APART,
+        may_differ=APART,
         places=PLACES,
     ) as rows:
         sites = rows.recordings()
@@ -113,14 +113,14 @@ def _recordings(table: Table, spec: dict, ledger: Ledger) -> Iterator[Recording]
             for values in rows.minutes(site):
                 survey.add(_complete(values))
             notes = [*left_out, *survey.notes()]  # once, with the first minute
-            for piece in rows.pieces(site, (MAX_FRAME_GAP + 0.5) * frame_s):
+            for piece in rows.slices(site, (MAX_FRAME_GAP + 0.5) * frame_s):
                 values = _complete(piece.values)
                 values["frame"] = np.round(values["t"] / frame_s)
                 name = f"{log}{piece.label}"
                 made = site_recording(
                     path, name, values, spec, survey, stamped=stamped, notes=notes
                 )
-                yield piece_of(log, made, piece)
+                yield piece.of_log(log, made)
                 notes = []
 
 
@@ -149,7 +149,7 @@ def _has_stamps(table: Table) -> bool:
     if any(cell and not cell.strip("0.") for cell in table.samples(column)):
         return False  # nothing else is read where the first rows say 0
     fields = Columns(needed={CLOCK: COLUMNS[CLOCK]}, called={CLOCK: column})
-    uncounted = Ledger(path=table.path)
+    uncounted = RowStats(path=table.path)
     read = (part[CLOCK] for part in batches(table, fields.fields(table), uncounted))
     lowest, highest = np.inf, -np.inf
     for part in read:
@@ -160,13 +160,13 @@ def _has_stamps(table: Table) -> bool:
     return bool(highest > lowest)
 
 
-def _open(path: Path, spec: dict) -> tuple[Table, Ledger]:
+def _open(path: Path, spec: dict) -> tuple[Table, RowStats]:
     """The portal's table, or the native text, whose columns the TOML names.
 
     Raises:
       InputError: a column is missing, or it is an arterial's file.
     """
-    table, ledger = open_log(path, spec)
+    table, stats = open_log(path, spec)
     if _is_native(table):
         columns = _text_columns(spec)
         if len(table.header) == ARTERIAL_COLUMNS != len(columns):
@@ -175,13 +175,13 @@ def _open(path: Path, spec: dict) -> tuple[Table, Ledger]:
                 "arterials have no straight lanes"
             )
         options = {"names": columns, "skip": 0, **section(spec, "table")}
-        table, ledger = open_log(path, {**spec, "table": options})
+        table, stats = open_log(path, {**spec, "table": options})
     if table.has(_column(table, JUNCTION)) and not table.has(_column(table, SITE)):
         raise InputError(
             f"{path}: column {SITE}: missing: expected it beside {JUNCTION}; "
             "arterials have no straight lanes"
         )
-    return table, ledger
+    return table, stats
 
 
 def _is_native(table: Table) -> bool:

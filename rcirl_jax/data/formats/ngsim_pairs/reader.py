@@ -33,7 +33,7 @@ from rcirl_jax.data.formats.options import (
     unit_factor,
 )
 from rcirl_jax.data.formats.tracks import split_tracks
-from rcirl_jax.data.readers.tables.ledger import LINE, with_news
+from rcirl_jax.data.readers.tables.rows import LINE, attach_row_stats
 from rcirl_jax.data.readers.tables.table import open_table
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
@@ -60,11 +60,11 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     groups = _groups(files)
     lengths = _leader_lengths(files, section(spec, "table"))
     for file in files:
-        table, ledger = open_log(file, spec)
+        table, stats = open_log(file, spec)
         columns = dataclasses.replace(TABLE, name_of=lambda _, f=file: _ids(f)[1])
-        rows = columns.read(table, ledger)
+        rows = columns.read(table, stats)
         made = _recording(file, spec, rows, groups[file], lengths)
-        yield validate_recording(with_news(made, ledger), file)
+        yield validate_recording(attach_row_stats(made, stats), file)
 
 
 def _ids(path: Path) -> tuple[str, str, str]:

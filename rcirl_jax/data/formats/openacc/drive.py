@@ -10,7 +10,7 @@ import numpy as np
 from rcirl_jax.data.formats.declared import Columns
 from rcirl_jax.data.formats.projection import utm, utm_zone
 from rcirl_jax.data.readers.tables.columnar import is_columnar
-from rcirl_jax.data.readers.tables.ledger import Ledger
+from rcirl_jax.data.readers.tables.rows import RowStats
 from rcirl_jax.data.readers.tables.streams import head_of
 from rcirl_jax.data.readers.tables.table import Table, open_table
 from rcirl_jax.errors import InputError
@@ -115,13 +115,13 @@ def open_drive(path: Path) -> Table:
     return open_table(path, {"delimiter": ",", "names": names, "skip": len(lines)})
 
 
-def read_drive(table: Table, spec: Mapping, ledger: Ledger) -> Drive:
+def read_drive(table: Table, spec: Mapping, stats: RowStats) -> Drive:
     """A file's cars that have positions, checked.
 
     Args:
       table: of `open_drive`.
       spec: source TOML.
-      ledger: of the file.
+      stats: of the file.
 
     Raises:
       InputError: no table of a drive, or numbers beyond any place, speed or time.
@@ -139,7 +139,7 @@ def read_drive(table: Table, spec: Mapping, ledger: Ledger) -> Drive:
         t=time,
         user=None,
         name_of=lambda _: "of the row",
-    ).read(table, ledger)
+    ).read(table, stats)
     about = {cells[0].lower(): cells[1:] for cells in _first_lines(path)[:-1] if cells}
     cars, notes = {}, []
     for number, found in sorted(columns.items()):

@@ -34,7 +34,7 @@ from rcirl_jax.data.formats.options import number, one_pattern
 from rcirl_jax.data.formats.paths import path_lanes
 from rcirl_jax.data.formats.shapes import local_origin
 from rcirl_jax.data.formats.tracks import spans_of, split_tracks, travel_heading
-from rcirl_jax.data.readers.tables.ledger import Ledger, allowed_share, with_news
+from rcirl_jax.data.readers.tables.rows import RowStats, allowed_share, attach_row_stats
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Recording, Track
@@ -63,9 +63,9 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """Recordings of `block_s` seconds, file by file."""
     for file in parts(path, spec):
         table = open_drive(file)
-        ledger = Ledger(path=file, unit=table.unit, allowed=allowed_share(spec))
-        for block in _blocks(read_drive(table, spec, ledger), spec):
-            yield validate_recording(with_news(block, ledger), file)
+        stats = RowStats(path=file, unit=table.unit, allowed=allowed_share(spec))
+        for block in _blocks(read_drive(table, spec, stats), spec):
+            yield validate_recording(attach_row_stats(block, stats), file)
 
 
 def _blocks(drive: Drive, spec: dict) -> Iterator[Recording]:

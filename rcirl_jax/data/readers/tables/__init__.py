@@ -1,6 +1,6 @@
 """Tables: text of any layout, compressed or not, Parquet and Feather.
 
-`table` is the reader; `streams` gives the text, `layout` says how it is written,
-`text_rows` and `columnar` the columns, `cells` their numbers, `ledger` and `repair`
-what is dropped.
+`table` is the reader; `streams` gives the text of a file, `text` says how it is written
+and cuts it into columns, `columnar` reads Parquet and Feather, `cells` turns cells into
+numbers, `rows` counts and drops rows.
 """

@@ -1,4 +1,4 @@
-"""The text of a file, a few MiB at a time: unpacked, decoded, in whole lines.
+"""The text of a file, a few MiB at a time: unpacked, decoded, in whole rows.
 
 What packs a file (gzip, zstd, bzip2) and how its characters are written (UTF-8 with
 and without a mark, UTF-16, else Windows' 1252) is told by its bytes, not its name. No
@@ -14,11 +14,11 @@ from typing import IO, Any
 
 from rcirl_jax.errors import InputError, extra_module
 
-READ_BYTES = 8 * 2**20  # bytes that are decoded at a time
+READ_CHARS = 4 * 2**20  # characters that are read at a time
 MAX_LINE = 2**24  # characters of a line; pNEUMA writes a drive of minutes into one
 MAX_SPAN = 20  # lines of one row, by line ends inside of quotes
 HEAD_LINES = 60  # lines from which a layout is recognised
-HEAD_BYTES = 2**16  # bytes read at a time for them
+HEAD_BYTES = 2**16  # bytes from which an encoding is recognised
 MIN_ASCII = 0.2  # share of a head's characters; another encoding has fewer
 PACKED = {
     b"\x1f\x8b": "gzip",
@@ -33,10 +33,16 @@ NO_TABLES = {
     b"SQLite format 3": "a database: expected a table; export it as CSV",
 }
 POINTER = b"version https://git-lfs.github.com/spec/"
+BYTE_ORDERS = (
+    (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)  # first bytes -> encoding
 
 
 def first_bytes(path: Path, count: int = 64) -> bytes:
-    """The first bytes of a file; none of what is no file."""
+    """Returns the first bytes of a file; none of what is no file."""
     if not path.is_file():
         return b""
     with path.open("rb") as file:
@@ -44,7 +50,7 @@ def first_bytes(path: Path, count: int = 64) -> bytes:
 
 
 def refuse_pointer(path: Path) -> None:
-    """Git LFS leaves a text of three lines where it has not fetched the data.
+    """Refuses the text of three lines that Git LFS leaves where it fetched no data.
 
     Raises:
       InputError: the file is one.
@@ -56,7 +62,7 @@ def refuse_pointer(path: Path) -> None:
 
 
 def packing(path: Path) -> str | None:
-    """What packs a file, by its first bytes; None: nothing known."""
+    """Returns what packs a file, by its first bytes; None: nothing known."""
     head = first_bytes(path)
     return next(
         (name for first, name in PACKED.items() if head.startswith(first)), None
@@ -65,7 +71,7 @@ def packing(path: Path) -> str | None:
 
 @contextlib.contextmanager
 def unpacked(path: Path) -> Iterator[tuple[Any, IO[bytes]]]:
-    """(stream of the bytes inside, the file itself) of a file that may be packed.
+    """Opens a file that may be packed: (stream of the bytes inside, the file itself).
 
     Raises:
       InputError: a damaged archive, a Git LFS pointer, a spreadsheet.
@@ -91,8 +97,39 @@ def unpacked(path: Path) -> Iterator[tuple[Any, IO[bytes]]]:
             ) from error
 
 
+@contextlib.contextmanager
+def _text(path: Path, encoding: str) -> Iterator[tuple[io.TextIOWrapper, IO[bytes]]]:
+    """Opens a text: line feeds end its lines, bad bytes show as numbers."""
+    with unpacked(path) as (stream, file):
+        try:
+            made = io.TextIOWrapper(stream, encoding, "backslashreplace")
+        except (LookupError, ValueError) as error:
+            raise InputError(
+                f"{path}: table.encoding: {encoding[:40]}: expected one that Python "
+                "knows, such as utf-8, utf-16, cp1252"
+            ) from error
+        try:
+            yield made, file
+        except (TypeError, UnicodeError) as error:  # no text, or no mark of utf-16
+            why = " ".join(str(error).split())[:100]
+            raise InputError(
+                f"{path}: text: {why}: expected {encoding[:40]}"
+            ) from error
+        finally:
+            made.detach()
+
+
+def _line(path: Path, text: io.TextIOWrapper) -> str:
+    line = text.readline(MAX_LINE + 1)
+    if len(line) > MAX_LINE:
+        raise InputError(
+            f"{path}: a line of more than {MAX_LINE} characters: expected one a row"
+        )
+    return line
+
+
 def head_of(path: Path, encoding: str = "") -> tuple[str, list[str]]:
-    """(encoding, first whole lines) of a text; fewer where they are long.
+    """Returns (encoding, first lines) of a text; fewer where they are long.
 
     Args:
       path: file.
@@ -101,42 +138,28 @@ def head_of(path: Path, encoding: str = "") -> tuple[str, list[str]]:
     Raises:
       InputError: an empty file, no text, an unknown encoding, a line without an end.
     """
-    with unpacked(path) as (stream, _):
-        data = stream.read(HEAD_BYTES)
-        encoding = encoding or _recognised(path, data)
-        decode, found, ended = _Decoder(path, encoding), "", False
-        while not ended and found.count("\n") < HEAD_LINES and len(found) <= MAX_LINE:
-            ended = not data
-            found += decode(data)
-            data = stream.read(HEAD_BYTES)
-    whole = found if ended else found[: found.rfind("\n") + 1]
-    if not whole and not ended:
-        raise line_error(path)
-    if not whole.strip():
+    if not encoding:
+        with unpacked(path) as (stream, _):
+            encoding = _recognised(path, bytes(stream.read(HEAD_BYTES)))
+    lines: list[str] = []
+    with _text(path, encoding) as (text, _):
+        while len(lines) < HEAD_LINES and sum(map(len, lines)) <= MAX_LINE:
+            if not (line := _line(path, text)):
+                break
+            lines.append(line)
+    some = "".join(lines)[:HEAD_BYTES]
+    if not any(line.strip() for line in lines):
         raise InputError(f"{path}: rows: none: expected a header and rows")
-    some = whole[:HEAD_BYTES]
     if sum(map(str.isascii, some)) < MIN_ASCII * len(some):  # digits are
         raise InputError(
             f"{path}: header: hardly any ASCII as {encoding}: expected a table"
         )
-    return encoding, whole.removesuffix("\n").split("\n")[:HEAD_LINES]
-
-
-def line_error(path: Path) -> InputError:
-    """What is wrong with a line longer than `MAX_LINE`."""
-    return InputError(
-        f"{path}: a line of more than {MAX_LINE} characters: expected one a row"
-    )
+    return encoding, [line.removesuffix("\n") for line in lines]
 
 
 def _recognised(path: Path, data: bytes) -> str:
-    """Encoding of a text by its first bytes."""
-    for mark, name in (
-        (codecs.BOM_UTF8, "utf-8-sig"),
-        (codecs.BOM_UTF32_LE, "utf-32"),
-        (codecs.BOM_UTF16_LE, "utf-16"),
-        (codecs.BOM_UTF16_BE, "utf-16"),
-    ):
+    """Returns the encoding of a text by its first bytes."""
+    for mark, name in BYTE_ORDERS:
         if data.startswith(mark):
             return name
     # of letters, digits and commas every other byte is 0
@@ -153,35 +176,10 @@ def _recognised(path: Path, data: bytes) -> str:
     return "utf-8"
 
 
-class _Decoder:
-    """Bytes -> text, line feeds at its lines' ends; bad bytes show as numbers."""
-
-    def __init__(self, path: Path, encoding: str) -> None:
-        self._path, self._encoding = path, encoding
-        try:
-            made = codecs.getincrementaldecoder(encoding)("backslashreplace")
-        except (LookupError, ValueError) as error:
-            raise InputError(
-                f"{path}: table.encoding: {encoding[:40]}: expected one that Python "
-                "knows, such as utf-8, utf-16, cp1252"
-            ) from error
-        self._made = io.IncrementalNewlineDecoder(made, translate=True)
-
-    def __call__(self, data: bytes) -> str:
-        """The text of the next bytes; none end it."""
-        try:
-            return self._made.decode(bytes(data), final=not data)
-        except (TypeError, ValueError) as error:  # no text, or no mark of utf-16
-            why = " ".join(str(error).split())[:100]
-            raise InputError(
-                f"{self._path}: text: {why}: expected {self._encoding[:40]}"
-            ) from error
-
-
 def blocks(
     path: Path, encoding: str, quote: str, show: Callable[[int], object] | None = None
-) -> Iterator[tuple[int, str, bool]]:
-    """(number of its first line, whole lines, whether they end the file) of a text.
+) -> Iterator[tuple[int, str]]:
+    """Yields (number of its first line, whole rows) of a text, a few MiB at a time.
 
     Args:
       path: file.
@@ -192,37 +190,20 @@ def blocks(
     Raises:
       InputError: a damaged archive, a line without an end.
     """
-    decode, rest, line, at = _Decoder(path, encoding), "", 1, 0
-    with unpacked(path) as (stream, file):
+    number, at = 1, 0
+    with _text(path, encoding) as (text, file):
         while True:
-            data = stream.read(READ_BYTES)
-            rest += decode(data)
+            parts = [text.read(READ_CHARS), _line(path, text)]
+            odd = sum(part.count(quote) for part in parts) % 2 if quote else 0
+            for _ in range(MAX_SPAN if odd else 0):
+                parts.append(_line(path, text))
+                if parts[-1].count(quote) % 2:
+                    break
+            block = "".join(parts)
             if show is not None:
                 show(file.tell() - at)
                 at = file.tell()
-            if not data:
-                break
-            cut = _cut(rest, quote)
-            if cut == 0 and len(rest) > MAX_LINE:
-                raise line_error(path)
-            if cut:
-                yield line, rest[:cut], False
-                line, rest = line + rest.count("\n", 0, cut), rest[cut:]
-    if rest:
-        yield line, rest, True
-
-
-def _cut(text: str, quote: str) -> int:
-    """Where the last whole row ends: not inside of quotes, if that can be told."""
-    last = text.rfind("\n") + 1
-    if not quote or not last or text.count(quote, 0, last) % 2 == 0:
-        return last
-    cut = last
-    for _ in range(MAX_SPAN):
-        before = text.rfind("\n", 0, max(cut - 1, 0)) + 1
-        if before == 0:
-            break
-        if text.count(quote, before, last) % 2 == 1:
-            return before
-        cut = before
-    return last
+            if not block:
+                return
+            yield number, block
+            number += block.count("\n")

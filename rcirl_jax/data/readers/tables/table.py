@@ -2,7 +2,7 @@
 
 `open_table` finds how a table is written, `batches` gives its columns in SI units a
 few MiB at a time, `read` all of them. A row that cannot be read, or lacks a needed
-cell, is dropped and counted in a `Ledger`, which refuses a table of too many; an empty
+cell, is dropped and counted in `RowStats`, which refuses a table of too many; an empty
 cell elsewhere is unknown. Every row keeps its line in the file, under `LINE`.
 """
 
@@ -17,13 +17,17 @@ import numpy as np
 from rcirl_jax.data.readers.tables import cells
 from rcirl_jax.data.readers.tables.columnar import (
     columnar_batches,
-    first_cells,
+    columns_of,
     is_columnar,
-    schema_of,
 )
-from rcirl_jax.data.readers.tables.layout import NUMBER, Layout, decimal_of, recognise
-from rcirl_jax.data.readers.tables.ledger import LINE, Ledger
-from rcirl_jax.data.readers.tables.text_rows import text_batches
+from rcirl_jax.data.readers.tables.rows import LINE, Rows, RowStats
+from rcirl_jax.data.readers.tables.text import (
+    NUMBER,
+    Layout,
+    decimal_of,
+    recognise,
+    text_batches,
+)
 from rcirl_jax.errors import InputError, did_you_mean, extra_module
 
 SAMPLES = 60  # rows from which the meaning of a column is recognised
@@ -34,6 +38,10 @@ CUT_IT = "cut it into recordings (a csv or NGSIM log: lower long_bytes)"
 MAX_PLACE_M = 1e8  # m, farther is no place on earth
 MAX_VELOCITY_MPS = 1e4  # m/s; keeps squares finite, recording.py has the true limit
 MAX_TIME = 1e14  # s, ms or frames; ms since 1970 are 2e12
+LIMITS = {
+    **{"time": MAX_TIME, "place": MAX_PLACE_M, "speed": MAX_VELOCITY_MPS},
+    **{"count": 1e12, "number": np.inf, "text": np.inf},
+}  # what cells are -> beyond it no log means anything, in the file's unit
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,23 +82,24 @@ class Table:
 
     @functools.cached_property
     def _places(self) -> dict[str, list[int]]:
-        return _numbered(self.header)
-
-    @functools.cached_property
-    def _small(self) -> dict[str, list[int]]:
-        return _numbered([name.casefold() for name in self.header])
+        """Name, also in small letters, -> the numbers of its columns."""
+        found: dict[str, list[int]] = {}
+        for change in (str, str.casefold):
+            names = list(map(change, self.header))
+            for name in set(names) - found.keys():
+                found[name] = [k for k, other in enumerate(names) if other == name]
+        return found
 
     def _found(self, column: str) -> list[int]:
         """Numbers of the columns of a name, else of that name in another case."""
-        exact = self._places.get(column)
-        return exact or self._small.get(column.casefold(), [])
+        return self._places.get(column) or self._places.get(column.casefold(), [])
 
     def has(self, column: str) -> bool:
         """Whether there is a column of this name; its case does not matter."""
         return bool(self._found(column))
 
     def place(self, column: str) -> int:
-        """Number of a column.
+        """Returns the number of a column.
 
         Raises:
           InputError: it is missing, or met twice.
@@ -105,43 +114,33 @@ class Table:
         hint = did_you_mean(column, known)
         if sum(bool(NUMBER.fullmatch(name)) for name in known) > len(known) / 2:
             hint = "; no header? name the columns by names in [table]"
-        raise InputError(
-            f"{where}: missing: expected it among {_shortened(known)}{hint}"
-        )
+        shown = [*known[:40], *(["..."] if len(known) > 40 else [])]
+        raise InputError(f"{where}: missing: expected it among {shown}{hint}")
 
     def unit_of(self, column: str) -> str:
-        """The unit of a column by the line below the header; "" without one."""
+        """Returns the unit of a column by the line below the header; "" without one."""
         units = self.layout.units if self.layout else ()
         return units[self.place(column)].strip("[]() ") if units else ""
 
     def marks(self, column: str) -> tuple[str, str]:
-        """(decimal mark, mark between thousands) of numbers written as text."""
+        """Returns (decimal mark, mark between thousands) of numbers written as text."""
         if self.layout is not None:
             return self.layout.decimal, self.layout.thousands
         return decimal_of([self.samples(column)], "")
 
     def samples(self, column: str) -> list[str]:
-        """Cells of a column in the first rows, as text."""
+        """Returns cells of a column in the first rows, as text."""
         place = self.place(column)
-        if self.layout is None:
-            return first_cells(self.path, self.header[place], SAMPLES)
-        return [row[place].strip() for row in self.head if len(row) > place]
-
-
-def _numbered(names: Sequence[str]) -> dict[str, list[int]]:
-    """Name -> the numbers of its columns."""
-    found: dict[str, list[int]] = {}
-    for place, name in enumerate(names):
-        found.setdefault(name, []).append(place)
-    return found
-
-
-def _shortened(names: Sequence[str]) -> list[str]:
-    return [*names[:40], *(["..."] if len(names) > 40 else [])]
+        if self.layout is not None:
+            return [row[place].strip() for row in self.head if len(row) > place]
+        for (found,), _ in columnar_batches(self.path, [self.header[place]]):
+            first = found.slice(0, SAMPLES).to_pylist()
+            return ["" if value is None else str(value) for value in first]
+        return []
 
 
 def open_table(path: Path, options: Mapping | None = None) -> Table:
-    """A table of any of the forms, its layout recognised.
+    """Opens a table of any of the forms, its layout recognised.
 
     Args:
       path: file.
@@ -151,7 +150,7 @@ def open_table(path: Path, options: Mapping | None = None) -> Table:
       InputError: no table.
     """
     if is_columnar(path):
-        return Table(path=path, header=tuple(schema_of(path).names))
+        return Table(path=path, header=tuple(columns_of(path)))
     layout, rows = recognise(path, options or {})
     head = tuple(tuple(row) for row in rows)
     return Table(path=path, header=layout.header, layout=layout, head=head)
@@ -159,24 +158,23 @@ def open_table(path: Path, options: Mapping | None = None) -> Table:
 
 def fields_of(
     table: Table,
-    needed: Sequence[str],
-    optional: Sequence[str] = (),
+    needed: Mapping[str, str],
+    optional: Mapping[str, str] | None = None,
     *,
-    texts: Sequence[str] = (),
-    limits: Mapping[str, float] | None = None,
     columns: Mapping[str, str] | None = None,
     factors: Mapping[str, float] | None = None,
+    lower: bool = False,
 ) -> list[Field]:
-    """Columns as fields: those needed, and others that are there.
+    """Returns columns as fields: those needed, and others that are there.
 
     Args:
       table: of `open_table`.
-      needed: fields without which a row is none.
-      optional: fields whose column may be missing, and whose cells may be empty.
-      texts: names among both that are no numbers.
-      limits: of numbers; beyond them they are absurd.
-      columns: names of columns, where they are not those of their fields.
-      factors: of units.
+      needed: field -> what its cells are (a key of `LIMITS`); a row without one of
+        them is none.
+      optional: likewise, fields whose column may be missing, and cells empty.
+      columns: field -> name of its column, where it is not the field's.
+      factors: field -> factor of its unit.
+      lower: texts are taken in small letters.
     """
     own = columns or {}
     return [
@@ -184,11 +182,12 @@ def fields_of(
             name=name,
             column=own.get(name, name),
             needed=name in needed,
-            text=name in texts,
-            limit=(limits or {}).get(name, np.inf),
+            text=kind == "text",
+            lower=lower and kind == "text",
+            limit=LIMITS[kind],
             factor=(factors or {}).get(name, 1.0),
         )
-        for name in (*needed, *optional)
+        for name, kind in {**needed, **(optional or {})}.items()
         if name in needed or table.has(own.get(name, name))
     ]
 
@@ -196,15 +195,15 @@ def fields_of(
 def batches(
     table: Table,
     fields: Sequence[Field],
-    ledger: Ledger,
+    stats: RowStats,
     show: Callable[[int], object] | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Columns of a few MiB of rows; texts as (codes, names).
+    """Yields columns of a few MiB of rows; texts as (codes, names).
 
     Args:
       table: of `open_table`.
       fields: what is read; with `user`, the rows of all users come below each other.
-      ledger: what is dropped is added to it.
+      stats: counts what is dropped.
       show: called with the bytes of the file just read.
 
     Raises:
@@ -214,9 +213,9 @@ def batches(
     if table.layout is not None:
         for made in text_batches(table.path, table.layout, places, show):
             for line, why in made.unreadable:
-                ledger.drop("unreadable", f"line {line}: {why}")
-            ledger.read += len(made.unreadable)
-            yield _batch(table, fields, made.columns, made.lines, ledger)
+                stats.drop("unreadable", f"line {line}: {why}")
+            stats.read += len(made.unreadable)
+            yield _batch(table, fields, made.columns, made.lines, stats)
         return
     done, size, last = 0, table.path.stat().st_size, 0.0
     names = [table.header[place] for place in places]
@@ -226,7 +225,7 @@ def batches(
         if show is not None:
             show(round(size * (share - last)))
         last = share
-        yield _batch(table, fields, columns, rows, ledger)
+        yield _batch(table, fields, columns, rows, stats)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -245,13 +244,7 @@ class _Column:
         """Whether a row [n] cannot be used for this cell."""
         return self.wrong | (self.empty & self.field.needed)
 
-    def kept(self, rows: np.ndarray) -> Any:  # noqa: ANN401
-        """Some rows in SI units; (codes, names) of texts."""
-        if self.names is not None:
-            return self.values[rows], self.names
-        return self.values[rows] * self.field.factor
-
-    def complaint(self, row: int, where: str) -> str:
+    def complaint(self, row: int) -> str:
         """What is wrong with the cell of a row."""
         field, value = self.field, self.values[row]
         cell = self.cells[row].as_py()
@@ -263,7 +256,7 @@ class _Column:
             expected = long if self.wrong[row] else "a text"
         elif np.isfinite(value) and abs(value) > field.limit:
             shown, expected = f"{value:g}", f"within {field.limit:g}"
-        return f"{where}: {field.column}: {shown}: expected {expected}"
+        return f"{field.column}: {shown}: expected {expected}"
 
 
 def _column(table: Table, field: Field, found: Any) -> _Column:  # noqa: ANN401
@@ -293,81 +286,73 @@ def _batch(
     fields: Sequence[Field],
     found: Sequence[Any],
     lines: np.ndarray,
-    ledger: Ledger,
+    stats: RowStats,
 ) -> dict[str, Any]:
-    """A batch's readable rows, of all users below each other."""
-    common: list[_Column] = []
-    owned: dict[str, list[_Column]] = {}
-    for field, cell in zip(fields, found, strict=True):
-        own = common if field.user is None else owned.setdefault(field.user, [])
-        own.append(_column(table, field, cell))
-    users = list(owned)
+    """A batch's readable rows in SI units, of all users below each other.
+
+    Rows without anything but a time are none at all.
+    """
+    made = [_column(table, *pair) for pair in zip(fields, found, strict=True)]
+    users = list(dict.fromkeys(field.user for field in fields if field.user))
     parts = []
-    for number, columns in enumerate(owned.values() or [[]]):
-        columns = [*common, *columns]
-        rows = _readable(table, columns, lines, ledger)
-        part = {column.field.name: column.kept(rows) for column in columns}
+    for number, user in enumerate(users or [None]):
+        columns = [c for c in made if c.field.user in (None, user)]
+        own = [
+            c.empty for c in columns if c.field.needed and c.field.name not in COMMON
+        ]
+        blank = np.all(own, axis=0) if len(own) > 1 else np.zeros(lines.size, bool)
+        bad = np.any([column.bad for column in columns], axis=0)
+        dropped = bad & ~blank
+        stats.read += int(np.sum(~blank))
+        if dropped.any():
+            row = int(np.argmax(dropped))
+            first = next(column for column in columns if column.bad[row])
+            why = f"{table.unit} {lines[row]}: {first.complaint(row)}"
+            stats.drop("unreadable", why, int(dropped.sum()))
+        rows = ~bad & ~blank
+        part: dict[str, Any] = {LINE: lines[rows]}
+        for column in columns:
+            values = column.values[rows]
+            part[column.field.name] = (
+                values * column.field.factor
+                if column.names is None
+                else (values, column.names)
+            )
         if users:
             part["id"] = np.full(int(rows.sum()), number), users
-        parts.append({LINE: lines[rows], **part})
+        parts.append(part)
     return parts[0] if len(parts) == 1 else _below_each_other(parts)
-
-
-def _readable(
-    table: Table, columns: Sequence[_Column], lines: np.ndarray, ledger: Ledger
-) -> np.ndarray:
-    """Rows [n] that are kept; those without anything but a time are none at all."""
-    own = [c.empty for c in columns if c.field.needed and c.field.name not in COMMON]
-    blank = np.all(own, axis=0) if len(own) > 1 else np.zeros(lines.size, bool)
-    bad = np.any([column.bad for column in columns], axis=0)
-    dropped = bad & ~blank
-    ledger.read += int(np.sum(~blank))
-    if dropped.any():
-        row = int(np.argmax(dropped))
-        first = next(column for column in columns if column.bad[row])
-        where = f"{table.unit} {lines[row]}"
-        ledger.drop("unreadable", first.complaint(row, where), int(dropped.sum()))
-    return ~bad & ~blank
 
 
 def _below_each_other(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Batches of the same fields as one; a column that some lack is unknown there."""
-    names = dict.fromkeys(name for part in parts for name in part)
     made: dict[str, Any] = {}
-    for name in names:
+    for name in dict.fromkeys(name for part in parts for name in part):
         columns = [part.get(name) for part in parts]
-        if any(isinstance(column, tuple) for column in columns):
-            made[name] = _texts_below(parts, name)
-        else:
+        sizes = [part[LINE].size for part in parts]
+        if not any(isinstance(column, tuple) for column in columns):
             filled = [
-                np.full(part[LINE].size, np.nan) if column is None else column
-                for part, column in zip(parts, columns, strict=True)
+                np.full(size, np.nan) if column is None else column
+                for size, column in zip(sizes, columns, strict=True)
             ]
             made[name] = np.concatenate(filled)
+            continue
+        known: dict[str, int] = {}
+        every = []
+        for size, column in zip(sizes, columns, strict=True):
+            codes, names = column or (np.zeros(size, np.int64), [""])
+            mine = [known.setdefault(text, len(known)) for text in names]
+            every.append(np.array(mine, np.int32)[codes])
+        made[name] = np.concatenate(every), list(known)
     return made
 
 
-def _texts_below(
-    parts: Sequence[dict[str, Any]], name: str
-) -> tuple[np.ndarray, list[str]]:
-    """(codes, names) of a text in several batches."""
-    known: dict[str, int] = {}
-    codes = []
-    for part in parts:
-        own, names = part.get(name, (np.zeros(part[LINE].size, np.int64), [""]))
-        mine = [known.setdefault(text, len(known)) for text in names]
-        codes.append(np.array(mine, np.int32)[own])
-    return np.concatenate(codes), list(known)
-
-
-def read(
-    table: Table, fields: Sequence[Field], ledger: Ledger
-) -> dict[str, np.ndarray]:
-    """All readable rows: numbers float64, NaN where unknown; texts str, "" likewise.
+def read(table: Table, fields: Sequence[Field], stats: RowStats) -> Rows:
+    """Returns all readable rows: numbers, NaN where unknown; texts, "" likewise.
 
     Raises:
       InputError: as `batches`; a table too long to be held whole, without rows, or
-        with more unreadable ones than the ledger allows.
+        with more unreadable ones than are allowed.
     """
     size = table.path.stat().st_size
     if size > MAX_BYTES:
@@ -376,14 +361,14 @@ def read(
             f"most; {CUT_IT}"
         )
     parts, rows = [], 0
-    for batch in batches(table, fields, ledger):
+    for batch in batches(table, fields, stats):
         parts.append(batch)
         rows += batch[LINE].size
         if rows > MAX_ROWS:
             raise InputError(
                 f"{table.path}: rows: more than {MAX_ROWS}: expected fewer; {CUT_IT}"
             )
-    ledger.check()
+    stats.check()
     whole = _below_each_other(parts)
     for name, column in whole.items():
         if isinstance(column, tuple):

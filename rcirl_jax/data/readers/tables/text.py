@@ -1,23 +1,31 @@
-"""How a table of text is written: recognised from its head, or as the TOML says.
+"""Tables of text: how one is written, and its rows as columns of cells.
 
 A delimiter is the one that cuts most lines into equally many cells. The header is the
 first line with as many cells; what stands above it (comments, `sep=;`) is passed over.
 A comma inside of numbers is a decimal comma unless it can only stand between thousands.
+What the TOML says wins.
+
+Each row keeps the number of its line. A row of another length than the header's is
+unreadable, unless what it has too much is empty; a last line that breaks off ends the
+reading. Rows that go on repeating their last columns are unfolded into one a group.
 """
 
 import collections
+import contextlib
 import csv
 import dataclasses
 import functools
 import itertools
 import re
 import string
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rcirl_jax.data.readers.tables.streams import head_of
-from rcirl_jax.errors import InputError
+import numpy as np
+
+from rcirl_jax.data.readers.tables.streams import MAX_SPAN, blocks, head_of
+from rcirl_jax.errors import InputError, extra_module
 from rcirl_jax.runtime.checked import check_names
 
 MAX_COLUMNS = 10_000  # of a table; logs have some dozens
@@ -41,10 +49,7 @@ MARKS = {
     "thousands": (*GROUPS, ""),
     "quote": ('"', "'", ""),
 }
-OPTIONS = (
-    *("delimiter", "decimal", "thousands", "encoding", "quote"),
-    *("skip", "names", "repeating"),
-)
+OPTIONS = ("delimiter", *MARKS, "encoding", "skip", "names", "repeating")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,10 +66,6 @@ class Layout:
     units: tuple[str, ...] = ()  # of the columns, in a line below the header
     # last columns of the header that a row goes on repeating: pNEUMA's one row a drive
     repeating: int = 0
-
-    def cells(self, line: str) -> list[str]:
-        """Cells of one line."""
-        return cells_of([line], self.delimiter, self.quote)[0]
 
     def in_words(self) -> str:
         """The layout in one line."""
@@ -89,7 +90,7 @@ def grouped(mark: str, decimal: str) -> str:
 
 
 def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
-    """The layout of a table, and the cells of its first rows.
+    """Returns the layout of a table, and the cells of its first rows.
 
     Args:
       path: file.
@@ -100,8 +101,21 @@ def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
     """
     given = _options(path, section)
     encoding, lines = head_of(path, given.get("encoding", ""))
-    lines = _without_hashes(lines)
-    quote = _quote(given, lines)
+    plain = [line for line in lines if line[:1] not in HASHES and line.strip()]
+    cells = re.split(r"[,;|\t]", plain[0]) if plain else []
+    # comments are all that is marked above a header without a mark; else the last
+    # marked line may be the header itself
+    has_header = len(cells) > 1 and not any(
+        NUMBER.fullmatch(cell.strip(" \"'")) for cell in cells
+    )
+    lines = [
+        line if line[:1] not in HASHES else ("" if has_header else line.lstrip("#% "))
+        for line in lines
+    ]
+    # double quotes; single ones where they enclose cells and no others do
+    text, single = "\n".join(lines), r"(^|[,;\t|])'[^'\n]*'([,;\t|]|$)"
+    is_single = '"' not in text and re.search(single, text, re.M)
+    quote = given.get("quote", "'" if is_single else '"')
     delimiter = given.get("delimiter") or _delimiter(lines, quote)
     rows = cells_of(lines, delimiter, quote)
     if "names" in given:
@@ -125,7 +139,13 @@ def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
             f"{path}: table.repeating: {repeating}: expected up to {len(header)}, the "
             "number of columns"
         )
-    if not repeating and "names" not in given and _has_row_names(header, below):
+    # rows with names: each has a cell more than the header, and no empty last one
+    if (
+        not repeating
+        and "names" not in given
+        and below
+        and all(len(row) == len(header) + 1 and row[-1].strip() for row in below)
+    ):
         header = ["", *header]
     decimal, thousands = decimal_of(below, delimiter)
     layout = Layout(
@@ -142,21 +162,40 @@ def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
     return layout, below
 
 
-def _without_hashes(lines: Sequence[str]) -> list[str]:
-    """Lines without the marks of comments; comments are empty.
+def _options(path: Path, section: Mapping) -> dict[str, Any]:
+    """Returns [table] of a source TOML, checked.
 
-    They are all that is marked above a header without a mark; else the last marked
-    line may be the header itself.
+    Raises:
+      InputError: an unknown option, or one of another form.
     """
-    plain = [line for line in lines if line[:1] not in HASHES and line.strip()]
-    cells = re.split(r"[,;|\t]", plain[0]) if plain else []
-    has_header = len(cells) > 1 and not any(
-        NUMBER.fullmatch(cell.strip(" \"'")) for cell in cells
-    )
-    return [
-        line if line[:1] not in HASHES else ("" if has_header else line.lstrip("#% "))
-        for line in lines
-    ]
+    found: dict[str, Any] = {}
+    check_names(f"{path}: table.", section, OPTIONS)
+    for name, value in section.items():
+        expected, is_right = "a text", isinstance(value, str)
+        if name in ("skip", "repeating"):
+            expected = "a number of lines or columns"
+            is_right = type(value) is int and 0 <= value <= MAX_COLUMNS
+        elif name == "names":
+            expected = "a list of names"
+            is_right = isinstance(value, list) and all(
+                isinstance(one, str) for one in value
+            )
+        elif is_right and name == "delimiter":
+            expected = f"one of {', '.join(DELIMITERS)}, or a mark"
+            value = DELIMITERS.get(value) or value
+            is_right = value == "\t" or (
+                len(value) == 1 and value in string.punctuation + " "
+            )
+        elif is_right and name in MARKS:
+            expected = f"one of {' '.join(MARKS[name])}"
+            is_right = value in MARKS[name]
+        if not is_right:
+            where = f"{path}: table.{name}: {section[name]}"
+            raise InputError(f"{where}: expected {expected}")
+        found[name] = value
+    if found.get("decimal") and found.get("decimal") == found.get("thousands"):
+        raise InputError(f"{path}: table.thousands: expected another than the decimal")
+    return found
 
 
 def _are_units(rows: Sequence[Sequence[str]], width: int) -> bool:
@@ -176,84 +215,20 @@ def _are_units(rows: Sequence[Sequence[str]], width: int) -> bool:
     return words > 0
 
 
-def _options(path: Path, section: Mapping) -> dict[str, Any]:
-    """[table] of a source TOML, checked.
-
-    Raises:
-      InputError: an unknown option, or one of another form.
-    """
-    found: dict[str, Any] = {}
-    check_names(f"{path}: table.", section, OPTIONS)
-    for name, value in section.items():
-        where = f"{path}: table.{name}: {value}"
-        if name in ("skip", "repeating"):
-            if type(value) is not int or not 0 <= value <= MAX_COLUMNS:
-                raise InputError(f"{where}: expected a number of lines or columns")
-        elif name == "names":
-            if not isinstance(value, list) or not all(map(_is_text, value)):
-                raise InputError(f"{where}: expected a list of names")
-        else:
-            value = _mark(where, name, value)
-        found[name] = value
-    if found.get("decimal") and found.get("decimal") == found.get("thousands"):
-        raise InputError(f"{path}: table.thousands: expected another than the decimal")
-    return found
-
-
-def _is_text(value: object) -> bool:
-    return isinstance(value, str)
-
-
-def _mark(where: str, name: str, value: object) -> str:
-    """An option of one character; "" says that there is none."""
-    if not isinstance(value, str):
-        raise InputError(f"{where}: expected a text")
-    if name == "encoding":
-        return value
-    if name == "delimiter":
-        value = DELIMITERS.get(value, value)
-        if value == "\t" or (len(value) == 1 and value in string.punctuation + " "):
-            return value
-        raise InputError(f"{where}: expected one of {', '.join(DELIMITERS)}, or a mark")
-    if value not in MARKS[name]:
-        raise InputError(f"{where}: expected one of {' '.join(MARKS[name])}")
-    return value
-
-
 def cells_of(lines: Sequence[str], delimiter: str, quote: str) -> list[list[str]]:
-    """Cells of each line, taken alone."""
-    if delimiter == BLANKS and not any(quote and quote in line for line in lines):
-        return [line.split() for line in lines]
+    """Returns the cells of each line, taken alone."""
     rows = []
     for line in lines:
-        text = re.sub(r"[ \t]+", " ", line.strip()) if delimiter == BLANKS else line
-        if not quote or quote not in text:
-            rows.append(text.split(delimiter))
-            continue
-        try:
-            rows.append(
-                next(
-                    csv.reader(
-                        [text],
-                        delimiter=delimiter,
-                        quotechar=quote,
-                        skipinitialspace=True,
-                    )
-                )
+        cells = line.split() if delimiter == BLANKS else line.split(delimiter)
+        if quote and quote in line:
+            text = " ".join(cells) if delimiter == BLANKS else line
+            reader = csv.reader(
+                [text], delimiter=delimiter, quotechar=quote, skipinitialspace=True
             )
-        except (csv.Error, StopIteration):
-            rows.append(text.split(delimiter))
+            with contextlib.suppress(csv.Error, StopIteration):
+                cells = next(reader)
+        rows.append(cells)
     return rows
-
-
-def _quote(given: Mapping, lines: Sequence[str]) -> str:
-    """Double quotes; single ones where they enclose cells and no others do."""
-    if "quote" in given:
-        return str(given["quote"])
-    text = "\n".join(lines)
-    if '"' not in text and re.search(r"(^|[,;\t|])'[^'\n]*'([,;\t|]|$)", text, re.M):
-        return "'"
-    return '"'
 
 
 def _delimiter(lines: Sequence[str], quote: str) -> str:
@@ -265,7 +240,7 @@ def _delimiter(lines: Sequence[str], quote: str) -> str:
         return lines[0][-1]
     best, most = BLANKS, (0.0, 0)
     for mark in TRIED:
-        counts = [_count(line, mark, quote) for line in lines]
+        counts = [len(row) for row in cells_of(lines, mark, quote)]
         width, times = max(
             collections.Counter(counts).items(), key=lambda item: (item[1], item[0])
         )
@@ -280,13 +255,6 @@ def _delimiter(lines: Sequence[str], quote: str) -> str:
     if width > 1 and times / len(blanks) > max(most[0], 0.5):
         return BLANKS
     return best if best != BLANKS else (BLANKS if max(blanks) > 1 else ",")
-
-
-def _count(line: str, mark: str, quote: str) -> int:
-    """Number of a line's cells."""
-    if quote and quote in line:
-        return len(cells_of([line], mark, quote)[0])
-    return line.count(mark) + 1
 
 
 def _header_line(rows: Sequence[Sequence[str]]) -> int:
@@ -337,13 +305,6 @@ def _trimmed(row: Sequence[str]) -> list[str]:
     return cells
 
 
-def _has_row_names(header: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
-    """Whether every row has a cell more than the header, and no empty last one."""
-    return bool(rows) and all(
-        len(row) == len(header) + 1 and row[-1].strip() for row in rows
-    )
-
-
 def decimal_of(rows: Sequence[Sequence[str]], delimiter: str) -> tuple[str, str]:
     """(decimal mark, mark between thousands) of the numbers in rows."""
     cells = itertools.chain.from_iterable(rows)
@@ -364,3 +325,140 @@ def decimal_of(rows: Sequence[Sequence[str]], delimiter: str) -> tuple[str, str]
         if any(mark != "." or decimal in c or c.count(".") > 1 for c in found):
             return decimal, mark
     return decimal, ""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TextBatch:
+    """A few MiB of rows."""
+
+    columns: list[Any]  # pyarrow's text arrays [n], of the columns asked for
+    lines: np.ndarray  # [n] int64, of each row
+    unreadable: list[tuple[int, str]]  # line and what is wrong with it
+
+
+def text_batches(
+    path: Path,
+    layout: Layout,
+    places: Sequence[int],
+    show: Callable[[int], object] | None = None,
+) -> Iterator[TextBatch]:
+    """Yields columns of a table, a few MiB at a time.
+
+    Args:
+      path: file.
+      layout: of its text.
+      places: numbers of the columns.
+      show: called with the bytes of the file just read.
+
+    Raises:
+      InputError: the last line breaks off, or a line has no end.
+    """
+    for start, whole in blocks(path, layout.encoding, layout.quote, show):
+        above = max(layout.skip - start + 1, 0)  # lines above the first row
+        text = whole.split("\n", above)[-1] if whole.count("\n") >= above else ""
+        if not text:
+            continue
+        if layout.delimiter == BLANKS:  # runs as one, none at the ends of lines
+            text = re.sub(r" {2,}", " ", text.replace("\t", " "))
+            text = text.replace("\n ", "\n").replace(" \n", "\n").strip(" ")
+        first, lines = start + above, text.count("\n") + (not text.endswith("\n"))
+        columns = None if layout.repeating else _columns_of(text, layout, places)
+        if columns is not None and len(columns[0]) == lines:
+            numbers = np.arange(first, first + lines)
+            yield TextBatch(columns=columns, lines=numbers, unreadable=[])
+            continue
+        made = _row_by_row(text, first, layout, places)
+        bad = made.unreadable[-1:]
+        if not text.endswith("\n") and bad and bad[0][0] == first + lines - 1:
+            raise InputError(
+                f"{path}: line {bad[0][0]}: {bad[0][1]}; the last line breaks off: "
+                "expected a whole file"
+            )
+        yield made
+
+
+def _columns_of(text: str, layout: Layout, places: Sequence[int]) -> list[Any] | None:
+    """Returns the columns of rows, one a line; None: some have another length."""
+    arrow, reading = extra_module("pyarrow"), extra_module("pyarrow.csv")
+    names = [f"c{place}" for place in range(len(layout.header))]
+    wanted = [names[place] for place in places]
+    if layout.quote:
+        spaced = f"{layout.delimiter} {layout.quote}"
+        text = text.replace(spaced, spaced.replace(" ", "", 1))
+    data = text.encode()
+    try:
+        table = reading.read_csv(
+            arrow.BufferReader(data),
+            read_options=reading.ReadOptions(
+                use_threads=False, block_size=len(data) + 1, column_names=names
+            ),
+            parse_options=reading.ParseOptions(
+                delimiter=layout.delimiter,
+                quote_char=layout.quote or False,
+                newlines_in_values=True,
+            ),
+            convert_options=reading.ConvertOptions(
+                column_types=dict.fromkeys(wanted, arrow.string()),
+                include_columns=list(dict.fromkeys(wanted)),
+                strings_can_be_null=False,
+            ),
+        )
+    except arrow.ArrowInvalid:
+        return None
+    return [table.column(name).combine_chunks() for name in wanted]
+
+
+def _row_by_row(
+    text: str, first: int, layout: Layout, places: Sequence[int]
+) -> TextBatch:
+    """Returns columns of rows of which some are none, repeat, or take several lines."""
+    width, fixed = len(layout.header), len(layout.header) - layout.repeating
+    rows: list[list[str]] = []
+    numbers: list[int] = []
+    unreadable: list[tuple[int, str]] = []
+    every, at = text.removesuffix("\n").split("\n"), 0
+    while at < len(every):
+        line, number, span = every[at], first + at, 1
+        if layout.quote and line.count(layout.quote) % 2:
+            span = _span(every[at : at + MAX_SPAN], layout)
+            line = " ".join(every[at : at + span])
+        at += max(span, 1)
+        if not span:
+            unreadable.append((number, "a quote without an end"))
+        if not line.strip():
+            continue
+        (cells,) = cells_of([line], layout.delimiter, layout.quote)
+        made = [cells]
+        if layout.repeating:
+            cells = _trimmed([cell.strip() for cell in cells])
+            groups = range(fixed, len(cells), layout.repeating)
+            made = [
+                [*cells[:fixed], *cells[k : k + layout.repeating]] for k in groups
+            ] or [cells]
+        for row in made:
+            while len(row) > width and not row[-1].strip():
+                row.pop()
+            if len(row) == width:
+                rows.append([row[place] for place in places])
+                numbers.append(number)
+            else:
+                unreadable.append((number, f"{len(row)} cells: expected {width}"))
+    arrow = extra_module("pyarrow")
+    columns = [
+        arrow.array([row[k] for row in rows], arrow.string())
+        for k in range(len(places))
+    ]
+    lines = np.array(numbers, np.int64)
+    return TextBatch(columns=columns, lines=lines, unreadable=unreadable)
+
+
+def _span(lines: Sequence[str], layout: Layout) -> int:
+    """Returns the lines of a row that goes on inside of quotes; 0: they have no end."""
+    reader = csv.reader(
+        lines, delimiter=layout.delimiter, quotechar=layout.quote, strict=True
+    )
+    try:
+        next(reader)
+    except csv.Error as error:
+        return 0 if "unexpected end" in str(error) else 1
+    return reader.line_num
