@@ -34,7 +34,7 @@ IMPORTERS = tuple(
 
 
 def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
-    """All recordings of one part, each validated; arguments as of `parts`."""
+    """Yields all recordings of one part, each validated; arguments as of `parts`."""
     importer: Importer = module_of(name).recordings
     for file in files_of(name, path):
         refuse_pointer(file)
@@ -48,7 +48,7 @@ def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
 
 
 def pieces(name: str, path: Path, spec: dict) -> list[dict]:
-    """Specs that each read a share of one part, in order; arguments as of `parts`.
+    """Returns specs that each read a share of one part; arguments as of `parts`.
 
     A format whose module has no `pieces(path, spec)` reads a part as a whole.
     """
@@ -57,25 +57,25 @@ def pieces(name: str, path: Path, spec: dict) -> list[dict]:
 
 
 def files_of(name: str, path: Path) -> list[Path]:
-    """The files that one part is read from: itself, if its module says nothing."""
+    """Returns the files of one part: itself, if its module says nothing."""
     found = getattr(module_of(name), "files_of", None)
     return [path] if found is None else found(path)
 
 
 def format_of(name: str) -> Format:
-    """What a format says of itself, without its reader."""
+    """Returns what a format says of itself, without its reader."""
     return importlib.import_module(f"{__name__}.{name}").FORMAT
 
 
 def module_of(name: str, module: str = "reader") -> types.ModuleType:
-    """A module of a format's folder."""
+    """Loads a module of a format's folder."""
     return importlib.import_module(f"{__name__}.{name}.{module}")
 
 
 def parts(
     name: str, input_path: Path | None, source: Path | None = None
 ) -> tuple[list[Path], dict]:
-    """Inputs that can be read apart from each other, in order, and the spec.
+    """Returns inputs that can be read apart from each other, in order, and the spec.
 
     The recordings of all parts, one part after the other, are those of the whole
     input. A format whose module has no `parts(path, spec)` is one part. Where it has
@@ -124,6 +124,6 @@ def parts(
 def read_recordings(
     name: str, input_path: Path | None, source: Path | None = None
 ) -> Iterator[Recording]:
-    """All recordings of an input, each validated; arguments and errors as `parts`."""
+    """Yields all recordings of an input; arguments and errors as of `parts`."""
     found, spec = parts(name, input_path, source)
     return itertools.chain.from_iterable(read_part(name, path, spec) for path in found)

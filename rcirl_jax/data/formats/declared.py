@@ -1,29 +1,26 @@
 """Formats of tables, declared: which columns they have, and what their cells are.
 
-What a format needs of a table is a `Columns`; what is odd about it is a short hook of
-its importer. Numbers have limits by what they are: beyond them no log means anything.
+A format states its columns as field -> kind of cells (`tables.table.LIMITS`); what is
+odd about it is a short hook of its reader.
 """
 
-import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rcirl_jax.data.formats.options import section
+from rcirl_jax.data.formats.perception import speed_of
+from rcirl_jax.data.formats.tracks import travel_heading
 from rcirl_jax.data.readers.tables.rows import (
     Rows,
     RowStats,
     allowed_share,
     drop_duplicates,
 )
-from rcirl_jax.data.readers.tables.table import (
-    Field,
-    Table,
-    fields_of,
-    open_table,
-    read,
-)
-from rcirl_jax.types import Kind
+from rcirl_jax.data.readers.tables.table import Table, fields_of, open_table, read
+from rcirl_jax.types import Kind, Track
 
 KINDS = {
     **dict.fromkeys(("pedestrian", "person", "animal"), Kind.PEDESTRIAN),
@@ -36,60 +33,103 @@ KINDS = {
 
 
 def with_numbers_and_texts(spec: dict, packaged: Mapping) -> dict:
-    """A user's source TOML, with the packaged one's options that are no tables."""
+    """Returns a user's source TOML, with the packaged one's numbers and texts."""
     plain = (bool, int, float, str)
     return {k: v for k, v in packaged.items() if isinstance(v, plain)} | spec
 
 
 def open_log(path: Path, spec: Mapping) -> tuple[Table, RowStats]:
-    """A table as its source TOML says, and what will become of its rows."""
+    """Opens a table as its source TOML says, and counts of its rows."""
     table = open_table(path, section(spec, "table"))
     return table, RowStats(path=path, unit=table.unit, allowed=allowed_share(spec))
 
 
+def read_log(
+    table: Table,
+    stats: RowStats,
+    needed: Mapping[str, str],
+    optional: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] | None = None,
+    **options: Any,  # noqa: ANN401
+) -> Rows:
+    """Returns the rows of a table, each road user once in a frame.
+
+    Args:
+      table: of `open_log`.
+      stats: of it, which counts what is dropped.
+      needed: as of `fields_of`.
+      optional: likewise.
+      columns: likewise.
+      **options: of `drop_duplicates`.
+    """
+    fields = fields_of(table, needed, optional, columns=columns)
+    return drop_duplicates(read(table, fields, stats), stats, **options)
+
+
+def size_of(rows: Rows, usual: Sequence[float]) -> tuple[float, float, bool]:
+    """Returns medians [m] of the known lengths and widths, and whether one is assumed.
+
+    Args:
+      rows: perhaps length and width [n] m; NaN, and 0, is unknown.
+      usual: m, length and width where no row says them.
+    """
+    known = [rows.get(field, np.zeros(0)) for field in ("length", "width")]
+    known = [sizes[sizes > 0.0] for sizes in known]  # NaN is not
+    length, width = (
+        float(np.median(sizes)) if sizes.size else float(default)
+        for sizes, default in zip(known, usual, strict=True)
+    )
+    return length, width, not all(sizes.size for sizes in known)
+
+
+def track_of(
+    name: str,
+    rows: Rows,
+    kind: Kind,
+    usual: Sequence[float],
+    *,
+    standing: float = 0.0,
+    **more: Any,  # noqa: ANN401
+) -> Track:
+    """Returns a track of its rows; unknown cells are filled.
+
+    Headings and speeds by the positions, sizes as of `size_of`.
+
+    Args:
+      name: of the track.
+      rows: t [s], x, y [m] and, if known, heading [rad], speed [m/s], length, width
+        [m], [n] each; NaN is unknown.
+      kind: of the road user.
+      usual: m, its length and width where no row says them.
+      standing: rad, heading of one that never moves, and has no other.
+      **more: other fields of Track.
+    """
+    t, x, y = (rows[field] for field in ("t", "x", "y"))
+    length, width, is_assumed = size_of(rows, usual)
+    return Track(
+        id=name,
+        kind=kind,
+        length=length,
+        width=width,
+        size_assumed=is_assumed,
+        t=t,
+        x=x,
+        y=y,
+        heading=_filled(rows, "heading", lambda: travel_heading(t, x, y, standing)),
+        speed=_filled(rows, "speed", lambda: speed_of(t, x, y)),
+        **more,
+    )
+
+
+def _filled(rows: Rows, field: str, other: Callable[[], np.ndarray]) -> np.ndarray:
+    """Values [n] where they are known, else others."""
+    if field not in rows:
+        return other()
+    unknown = np.isnan(rows[field])
+    return np.where(unknown, other(), rows[field]) if unknown.any() else rows[field]
+
+
 def unknown_kinds(what: str, found: Iterable[str]) -> list[str]:
-    """The note on classes that nobody knows."""
+    """Returns the note on classes that nobody knows."""
     unknown = sorted(set(found) - {*KINDS})
     return [f"{what} taken for vehicles: {', '.join(unknown)}"] if unknown else []
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Columns:
-    """The columns of a format's tables."""
-
-    # field -> what its cells are: time, place, speed, count, number or text
-    needed: Mapping[str, str]  # a row without one of them is none
-    optional: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    called: Mapping[str, str] = dataclasses.field(default_factory=dict)  # the column
-    factors: Mapping[str, float] = dataclasses.field(default_factory=dict)  # of units
-    t: str = "t"
-    user: str | None = "id"  # None: a row is of all road users
-    places: tuple[str, ...] = ("x", "y")
-    name_of: Callable[[Any], str] = str  # an id as the file has it
-
-    def fields(self, table: Table) -> list[Field]:
-        """Fields of a table: those needed, and others whose column is there."""
-        return fields_of(
-            table,
-            self.needed,
-            self.optional,
-            columns=self.called,
-            factors=self.factors,
-        )
-
-    def read(self, table: Table, stats: RowStats) -> Rows:
-        """Rows in SI units, each road user once in a frame.
-
-        Args:
-          table: of `open_log`.
-          stats: of it, which counts what is dropped.
-        """
-        rows = read(table, self.fields(table), stats)
-        return drop_duplicates(
-            rows,
-            stats,
-            t=self.t,
-            user=self.user,
-            places=self.places,
-            name_of=self.name_of,
-        )

@@ -21,29 +21,19 @@ PACKED_ENDINGS = (".gz", ".zst", ".bz2")
 TABLE_ENDINGS = (".csv", ".tsv", ".txt", ".parquet", ".feather", ".arrow")
 
 
-def input_files(path: Path, pattern: str) -> list[Path]:
-    """The file itself, or a folder's matching files sorted by name."""
+def files_below(
+    path: Path, patterns: str | Sequence[str], what: str = "log files"
+) -> list[Path]:
+    """Returns the file itself, or those at any depth that match a pattern, sorted.
+
+    Args:
+      path: file or folder.
+      patterns: of file names.
+      what: is said to be expected.
+    """
     if path.is_file():
         return [path]
-    found = sorted(file for file in path.glob(pattern) if is_input(path, file))
-    if not found:
-        raise InputError(f"{path}: no file matches {pattern}: expected log files")
-    return found
-
-
-def files_below(path: Path, pattern: str) -> list[Path]:
-    """The file itself, or matching files at any depth, sorted by relative path."""
-    if path.is_dir():
-        found = {file for file in path.rglob(pattern) if is_input(path, file)}
-        if found:
-            return sorted(found)
-    return input_files(path, pattern)
-
-
-def files_matching(path: Path, wanted: Sequence[str], what: str) -> list[Path]:
-    """The file itself, or those at any depth that match a pattern, sorted."""
-    if path.is_file():
-        return [path]
+    wanted = [patterns] if isinstance(patterns, str) else patterns
     found = {file for pattern in wanted for file in path.rglob(pattern)}
     files = sorted(file for file in found if is_input(path, file))
     if not files:
@@ -54,7 +44,7 @@ def files_matching(path: Path, wanted: Sequence[str], what: str) -> list[Path]:
 
 
 def firsts_of_a_name(files: Iterable[Path]) -> list[Path]:
-    """Files in one folder with one name are the same log: the first of them counts."""
+    """Returns the first of those of one name in one folder: they are the same log."""
     found: dict[tuple[Path, str], Path] = {}
     for file in files:
         found.setdefault((file.parent, table_stem(file)), file)
@@ -62,7 +52,7 @@ def firsts_of_a_name(files: Iterable[Path]) -> list[Path]:
 
 
 def given_map(spec: Mapping) -> Path | None:
-    """The file or folder of maps that the option `map` names; None without it."""
+    """Returns the file or folder that the option `map` names; None without it."""
     given = path_option(spec, "map")
     if given and not Path(given).exists():
         raise InputError(f"{given}: map: missing: expected a file or folder")
@@ -82,7 +72,7 @@ def is_input(folder: Path, file: Path) -> bool:
 def with_log_names(
     path: Path, files: Sequence[Path], spec: dict, name_of: Callable[[Path], str]
 ) -> dict:
-    """The spec, with names for logs that are called alike in several folders.
+    """Returns the spec, with names for logs that are called alike in several folders.
 
     Their relative folder comes first (FOLDER/NAME); every other log keeps its name.
 
@@ -102,12 +92,12 @@ def with_log_names(
 
 
 def log_name(file: Path, spec: Mapping, name: str) -> str:
-    """`name`, or the one that tells a log from others called alike."""
+    """Returns `name`, or the one that tells a log from others called alike."""
     return spec.get("log_names", {}).get(str(file), name)
 
 
 def listing(path: Path) -> list:
-    """Names, sizes and times of change of all that an importer may read.
+    """Returns names, sizes and times of change of all that an importer may read.
 
     The input, what lies beside it (groups of vehicles, lanes), and folders of maps
     above it.
@@ -123,7 +113,7 @@ def listing(path: Path) -> list:
 
 
 def table_stem(path: Path) -> str:
-    """Name of a table's file without its endings: log of log.csv.gz."""
+    """Returns the name of a table's file without its endings: log of log.csv.gz."""
     name = path.name
     for endings in (PACKED_ENDINGS, TABLE_ENDINGS):
         name = next((name.removesuffix(e) for e in endings if name.endswith(e)), name)

@@ -324,8 +324,7 @@ class Windows:
             if first - last > self.max_gap_s:
                 self._starts.setdefault(user, []).append(first)
             self._last[user] = max(last, float(track.t[-1]))
-        piece = long_logs.Piece(
-            recording=None,
+        part = long_logs.TimeSlice(
             number=number,
             values={},
             within=within,
@@ -334,7 +333,7 @@ class Windows:
         )
         name = f"{self.drive}-{number:03d}"
         made = dataclasses.replace(made, name=name, group=self.group)
-        return long_logs.piece_of(self.drive, made, piece)
+        return part.of_log(self.drive, made)
 
 
 def check_held(where: str, count: int) -> None:

@@ -42,7 +42,7 @@ KINDS = ("vehicle", "cyclist", "pedestrian", "static")
 
 
 def number(spec: Mapping, key: str, default: float = math.nan) -> float:
-    """A finite number from a source TOML."""
+    """Returns a finite number from a source TOML."""
     value = spec.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"source TOML: {key}: {value}: expected a number")
@@ -56,7 +56,7 @@ def number(spec: Mapping, key: str, default: float = math.nan) -> float:
 
 
 def stated(spec: Mapping, key: str) -> float | None:
-    """A number > 0 that the user's own TOML states; None where it is a default.
+    """Returns a number > 0 that the user's own TOML states; None where it is a default.
 
     What a user's TOML says of a site counts as known, a packaged TOML's as a guess.
     """
@@ -64,7 +64,7 @@ def stated(spec: Mapping, key: str) -> float | None:
 
 
 def unit_factor(path: Path, field: str, unit: str, allowed: Sequence[str]) -> float:
-    """Factor from a declared unit to SI."""
+    """Returns the factor from a declared unit to SI."""
     if unit not in allowed:
         raise InputError(
             f"{path}: units.{field}: {unit}: expected one of {', '.join(allowed)}"
@@ -73,7 +73,7 @@ def unit_factor(path: Path, field: str, unit: str, allowed: Sequence[str]) -> fl
 
 
 def section(spec: Mapping, key: str) -> dict:
-    """A [table] of the source TOML; empty if it has none."""
+    """Returns a [table] of the source TOML; empty if it has none."""
     value = spec.get(key, {})
     if not isinstance(value, dict):
         raise InputError(f"source TOML: {key}: {value}: expected a table [{key}]")
@@ -81,7 +81,7 @@ def section(spec: Mapping, key: str) -> dict:
 
 
 def positive(spec: Mapping, key: str, default: float = math.nan) -> float:
-    """A number > 0 from a source TOML."""
+    """Returns a number > 0 from a source TOML."""
     value = number(spec, key, default)
     if value <= 0.0:
         raise InputError(f"source TOML: {key}: {value:g}: expected > 0")
@@ -89,7 +89,7 @@ def positive(spec: Mapping, key: str, default: float = math.nan) -> float:
 
 
 def recording_car(spec: Mapping) -> tuple[tuple[float, float], ...]:
-    """`Track.automated` of the car that recorded, by the option `recording_car`."""
+    """Returns `Track.automated` of the recording car (option `recording_car`)."""
     spans = {"human": (), "automated": ((-math.inf, math.inf),)}
     driver = spec.get("recording_car", "automated")
     if driver not in spans:
@@ -102,7 +102,7 @@ def recording_car(spec: Mapping) -> tuple[tuple[float, float], ...]:
 def lane_types(
     spec: Mapping, allowed: Sequence[str], default: Sequence[str]
 ) -> tuple[str, ...]:
-    """The option `lane_types`: a list of names, each one of those allowed."""
+    """Returns the option `lane_types`: a list of names, each one of those allowed."""
     value = spec.get("lane_types", default)
     for name in value if isinstance(value, list | tuple) else [value]:
         if name not in allowed:
@@ -114,7 +114,7 @@ def lane_types(
 
 
 def patterns(spec: Mapping, default: Sequence[str]) -> tuple[str, ...]:
-    """The option `pattern`: one file name pattern or a list of them."""
+    """Returns the option `pattern`: one file name pattern or a list of them."""
     value = spec.get("pattern", list(default))
     found = [value] if isinstance(value, str) else value
     if not isinstance(found, list) or not found or not all(map(_is_pattern, found)):
@@ -125,7 +125,7 @@ def patterns(spec: Mapping, default: Sequence[str]) -> tuple[str, ...]:
 
 
 def one_pattern(spec: Mapping, default: str) -> str:
-    """The option `pattern` of a format that has one only."""
+    """Returns the option `pattern` of a format that has one only."""
     found = patterns(spec, [default])
     if len(found) != 1:
         raise InputError(
@@ -151,17 +151,16 @@ def _is_pattern(item: object) -> bool:
     if not isinstance(item, str) or item.startswith("/"):
         return False
     names = PurePosixPath(item).parts
+    others = [name for name in names if name != "**"]
     return (
         0 < len(names) <= MAX_PARTS
-        and names.count("**") <= 1
-        and all(
-            is_file_name(name) and ("**" not in name or name == "**") for name in names
-        )
+        and len(names) - len(others) <= 1
+        and all(is_file_name(name) and "**" not in name for name in others)
     )
 
 
 def path_option(spec: Mapping, key: str) -> str:
-    """An option that names a file or folder; "" without one."""
+    """Returns an option that names a file or folder; "" without one."""
     value = spec.get(key, "")
     names = value.split("/") if isinstance(value, str) else []
     if not names or any(name and not _is_name(name) for name in names):
@@ -175,7 +174,7 @@ def path_option(spec: Mapping, key: str) -> str:
 
 
 def check_options(spec: Mapping, packaged: Mapping, form: Format) -> None:
-    """Options are known, and have the types of those that the format has.
+    """Checks that options are known, and have the types of those that the format has.
 
     In a table whose values are all of one type any value is of that type.
 
@@ -250,7 +249,7 @@ def _is_uniform(values: Sequence) -> bool:
 
 
 def kind_of(where: str, found: str, kinds: Mapping[str, str]) -> Kind:
-    """Kind of a road user by its type in the file and [kinds] of the TOML."""
+    """Returns the kind of a road user by its type and [kinds] of the TOML."""
     kind = kinds.get(found)
     if found not in kinds:
         raise InputError(

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.formats.lanes import path_lanes
 from rcirl_jax.data.formats.options import STATED, number, positive, section, stated
-from rcirl_jax.data.formats.paths import path_lanes
 from rcirl_jax.data.formats.shapes import local_origin
 from rcirl_jax.data.formats.tracks import once_each, split_tracks
 from rcirl_jax.data.recording import LENGTH_RANGE_M, MAX_SPEED_MPS, WIDTH_RANGE_M

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rcirl_jax.data.formats import IMPORTERS, format_of, module_of
 from rcirl_jax.data.formats.files import is_input
-from rcirl_jax.data.readers.tables.table import Table, open_table
+from rcirl_jax.data.readers.tables.table import open_table
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml, spec_root
 
@@ -15,7 +15,7 @@ TABLES = ("*.csv", "*.tsv", "*.txt", "*.parquet", "*.feather", "*.gz", "*.zst")
 
 
 def recognised_format(path: Path | None, source: Path | None = None) -> str:
-    """The format of an input; synthetic traffic where there is none.
+    """Returns the format of an input; synthetic traffic where there is none.
 
     Args:
       path: file or folder.
@@ -42,7 +42,22 @@ def recognised_format(path: Path | None, source: Path | None = None) -> str:
     if found:
         each = ", ".join(f"{file.name} of {name}" for name, file in found.items())
         raise InputError(f"{path}: format: not given: expected one of them for {each}")
-    raise InputError(_unknown(path))
+    files = [path] if path.is_file() else _matching(path, TABLES)
+    table = next((f for f in files if f.is_file() and any(map(f.match, TABLES))), None)
+    if table is not None:
+        raise InputError(
+            f"{table}: format: not given: a table of no known data set: expected "
+            "format csv with a source TOML that names its columns, which "
+            f"`rcirl import --suggest={table}` writes"
+        )
+    raise InputError(
+        f"{path}: format: not given: no files of a known format: expected "
+        f"one of {', '.join(sorted(IMPORTERS))}"
+    )
+
+
+def _matching(path: Path, patterns: tuple[str, ...]) -> Iterator[Path]:
+    return itertools.chain.from_iterable(map(path.rglob, patterns))
 
 
 def _candidates(path: Path) -> Iterator[Path]:
@@ -50,62 +65,31 @@ def _candidates(path: Path) -> Iterator[Path]:
     yield path
     if path.is_dir():
         names = (name for form in IMPORTERS for name in format_of(form).names)
-        for pattern in (*names, *TABLES):
-            yield from (
-                p for p in path.rglob(pattern) if p.is_dir() or is_input(path, p)
-            )
+        for found in _matching(path, (*names, *TABLES)):
+            if found.is_dir() or is_input(path, found):
+                yield found
 
 
 def _format_of(file: Path, source: Path | None) -> str:
     """The format of one file or folder, "" where it is none that is known."""
-    for name in IMPORTERS:
-        if any(map(file.match, format_of(name).names)):
+    forms = {name: format_of(name) for name in IMPORTERS}
+    for name, form in forms.items():
+        if any(map(file.match, form.names)):
             return name
     if not file.is_file():
         return ""
     try:
         table = open_table(file)
     except InputError:
-        return _told(file, None)
-    return _table_format(table, source)
-
-
-def _table_format(table: Table, source: Path | None) -> str:
-    header = {name.lower() for name in table.header}
-    for name in IMPORTERS:
-        if any(columns <= header for columns in format_of(name).columns):
+        table = None
+    header = {name.lower() for name in table.header} if table else set()
+    for name, form in forms.items():
+        if any(columns <= header for columns in form.columns):
             return name
-    if name := _told(table.path, table):
-        return name
+    for name, form in forms.items():  # told by more than columns
+        if form.told_by and module_of(name, form.told_by).is_log(file, table):
+            return name
     packaged = load_toml(spec_root() / "sources" / "csv.toml")["columns"]
     needed = {packaged[field] for field in ("t", "id", "x", "y")}
-    return "csv" if source is not None or needed <= set(table.header) else ""
-
-
-def _told(file: Path, table: Table | None) -> str:
-    """The format that tells a table by more than its columns, "" if none does."""
-    for name in IMPORTERS:
-        told_by = format_of(name).told_by
-        if told_by and module_of(name, told_by).is_log(file, table):
-            return name
-    return ""
-
-
-def _unknown(path: Path) -> str:
-    """What is wrong with an input of no known format, and what to do."""
-    tables = [
-        file
-        for pattern in TABLES
-        for file in ([path] if path.is_file() else path.rglob(pattern))
-        if file.match(pattern) and file.is_file()
-    ]
-    if tables:
-        return (
-            f"{tables[0]}: format: not given: a table of no known data set: expected "
-            "format csv with a source TOML that names its columns, which "
-            f"`rcirl import --suggest={tables[0]}` writes"
-        )
-    return (
-        f"{path}: format: not given: no files of a known format: expected "
-        f"one of {', '.join(sorted(IMPORTERS))}"
-    )
+    is_csv = table and (source is not None or needed <= set(table.header))
+    return "csv" if is_csv else ""

@@ -19,7 +19,7 @@ FRACTION_DIGITS = 7  # fractions of a line that differ by less are one
 
 
 def local_origin(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Origin [2] m to subtract: zero unless the positions lie far from (0, 0).
+    """Returns the origin [2] m to subtract: zero unless positions lie far from (0, 0).
 
     The package computes in float32 later, which resolves 1 mm at 10 km only.
     """
@@ -30,7 +30,7 @@ def local_origin(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def origin_notes(origin: np.ndarray) -> list[str]:
-    """The note that says where a local origin lies; none for (0, 0)."""
+    """Returns the note that says where a local origin lies; none for (0, 0)."""
     if not origin.any():
         return []
     return [f"local origin at x = {origin[0]:.0f} m, y = {origin[1]:.0f} m"]
@@ -39,7 +39,7 @@ def origin_notes(origin: np.ndarray) -> list[str]:
 def check_coordinates(
     path: Path | str, where: str, fields: Sequence[str], values: np.ndarray
 ) -> None:
-    """Every coordinate is finite and on Earth.
+    """Checks that every coordinate is finite and on Earth.
 
     Args:
       path: file, named in errors.
@@ -58,18 +58,18 @@ def check_coordinates(
 
 
 def arc_length(points: np.ndarray) -> np.ndarray:
-    """Length [n] m of a polyline [n, 2] up to each of its points."""
+    """Returns the length [n] m of a polyline [n, 2] up to each of its points."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
 
 
 def fractions(points: np.ndarray) -> np.ndarray:
-    """Arc length at each point over the line's length, [n] from 0 to 1."""
+    """Returns the arc length at each point over the line's length, [n] from 0 to 1."""
     arc = arc_length(points)
     return arc / max(arc[-1], 1e-9)
 
 
 def resample(points: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Points [len(at), 2] of a polyline at fractions of its length.
+    """Returns points [len(at), 2] of a polyline at fractions of its length.
 
     By hand, because shapely starts at the line's beginning for every point: 9 times
     slower at 100 points of 100, 230 times at 512 of 2,000.
@@ -79,14 +79,14 @@ def resample(points: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def moves(points: np.ndarray) -> np.ndarray:
-    """Mask [n] of points that differ from the one before; the first does."""
+    """Returns a mask [n] of points that differ from the one before; the first does."""
     return np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])
 
 
 def between_bounds(
     left: np.ndarray, right: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Centre line [m, 2] and half width [m] of a lane between two polylines.
+    """Returns centre line [m, 2] and half width [m] of a lane between two polylines.
 
     Both bounds run in driving direction; points at equal fractions of their
     lengths face each other.
@@ -103,7 +103,7 @@ def between_bounds(
 def distances_to_lines(
     points: np.ndarray, lines: Sequence[np.ndarray], which: np.ndarray
 ) -> np.ndarray:
-    """Distance [n] m of points [n, 2] from polylines, by shapely.
+    """Returns distances [n] m of points [n, 2] from polylines, by shapely.
 
     The shortest line from one that is prepared is found by a tree; a distance by
     walking along it for every point. Near zero, coordinates lose no digits.
@@ -129,14 +129,14 @@ def distances_to_lines(
 
 
 def distance_to_line(points: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Distance [n] m of points [n, 2] from one polyline [m >= 1, 2]."""
+    """Returns distances [n] m of points [n, 2] from one polyline [m >= 1, 2]."""
     return distances_to_lines(points, [line], np.zeros(len(points), np.int64))
 
 
 def line_across(
     centre: np.ndarray, left: np.ndarray, right: np.ndarray, point: np.ndarray
 ) -> np.ndarray:
-    """End points [2, 2] m, left first, of a line across a lane near a point.
+    """Returns end points [2, 2] m, left first, of a line across a lane near a point.
 
     It lies where the point's projection falls on the centre line, which is its
     first or last point if the given one lies before or behind the lane. By hand,

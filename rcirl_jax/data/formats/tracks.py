@@ -23,7 +23,7 @@ def split_tracks(
     reuse: float = np.inf,
     places: np.ndarray | None = None,
 ) -> list[tuple[str, np.ndarray]]:
-    """Rows of each track: one road user without a gap.
+    """Returns the rows of each track: one road user without a gap.
 
     A gap longer than `max_gap` starts another track of the same id, named
     "id#2", "id#3", ... A step back by more than `reuse` is a number given to
@@ -81,7 +81,7 @@ def split_tracks(
 
 
 def once_each(ids: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """Rows [n] of which each id has one at a time, and a note on the others.
+    """Returns rows [n] of which each id has one at a time, and a note on the others.
 
     The first of several counts. All rows where too many are doubled: then the file is
     wrong, and `split_tracks` says so.
@@ -101,7 +101,7 @@ def once_each(ids: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, list[str]]:
 
 
 def of_one_name(tracks: Sequence[Track]) -> tuple[list[Track], list[str]]:
-    """Tracks of which each has a name of its own, and a note on the others.
+    """Returns tracks of which each has a name of its own, and a note on the others.
 
     The longest of several of one name counts. All of them where more than a tenth, and
     more than one, are too many: then the file is wrong, and validation says so.
@@ -119,7 +119,7 @@ def of_one_name(tracks: Sequence[Track]) -> tuple[list[Track], list[str]]:
 
 
 def spans_of(t: np.ndarray, holds: np.ndarray) -> tuple[tuple[float, float], ...]:
-    """(begin, end) of each run of samples [n] that hold, up to the next that does not.
+    """Returns (begin, end) of each run of samples [n] that hold, to the next one.
 
     The last run has no end. t [n] s in any order.
     """
@@ -132,7 +132,7 @@ def spans_of(t: np.ndarray, holds: np.ndarray) -> tuple[tuple[float, float], ...
 def travel_heading(
     t: np.ndarray, x: np.ndarray, y: np.ndarray, standing: float = 0.0
 ) -> np.ndarray:
-    """Direction of travel [n] rad, over a second around each sample.
+    """Returns the direction of travel [n] rad, over a second around each sample.
 
         heading(t) = atan2(y(t + h) - y(t - h), x(t + h) - x(t - h)),  h = 0.5 s
 

@@ -12,7 +12,7 @@ DELAY_S = 2.0  # s; what is read faster shows no bar
 
 @contextlib.contextmanager
 def reading(path: Path, files: Sequence[Path]) -> Iterator[Callable[[int], object]]:
-    """A function to be called with the bytes just read of the files.
+    """Gives a function to be called with the bytes just read of the files.
 
     The bar stands below that of the import, shows bytes/s and the time left, and
     goes when all is read. Processes that the import started show none.

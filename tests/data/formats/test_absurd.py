@@ -75,7 +75,7 @@ def test_a_log_that_is_held_whole_has_a_size(name, tmp_path):
 def test_a_line_without_an_end_is_not_held(name, where, tmp_path, monkeypatch):
     """All of it on one line; a sound head, then a line of cells, or of a wide one."""
     monkeypatch.setattr(streams, "MAX_LINE", 2**14)
-    monkeypatch.setattr(streams, "READ_BYTES", 2**12)
+    monkeypatch.setattr(streams, "READ_CHARS", 2**12)
     monkeypatch.setattr(streams, "HEAD_BYTES", 2**12)
     file = first_file(name, tmp_path / "in")
     rows = file.read_text().splitlines(keepends=True)

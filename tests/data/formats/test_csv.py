@@ -123,15 +123,6 @@ def test_oncoming_lanes_run_the_other_way(tmp_path):
     assert first.left_width[0] == pytest.approx(1.75)
 
 
-def test_lanes_along_paths_where_none_are_known(tmp_path):
-    header = w.CSV_COLUMNS[:-1]
-    rows = [row[:-1] for row in w.csv_rows()]
-    source = w.csv_spec(tmp_path / "s.toml", columns=header)
-    recording = only(log(tmp_path, rows, header), source)
-    assert sorted(lane.centre[0, 1] for lane in recording.lanes) == [-7.0, -3.5, 0.0]
-    assert any("fitted" in note for note in recording.notes)
-
-
 LANES = """
 [[lanes]]
 id = "1"
@@ -293,12 +284,3 @@ def test_far_coordinates_get_a_local_origin(tmp_path):
     recording = only(log(tmp_path, rows), w.csv_spec(tmp_path / "s.toml"))
     np.testing.assert_allclose(recording.tracks[0].x, 1.5 * np.arange(40))
     assert any("local origin" in note for note in recording.notes)
-
-
-@pytest.mark.dataset
-def test_recorded_ngsim_subset_declared_as_feet(data_dir, tmp_path):
-    path = data_dir / "formats" / "ngsim_reference" / "ngsim_us101_subset_SIunits.csv"
-    units = 't = "ms"\nx = "ft"\ny = "ft"'
-    source = w.csv_spec(tmp_path / "s.toml", columns=SI_COLUMNS, units=units)
-    with pytest.raises(InputError, match="feet taken for metres"):
-        read(path, source)

@@ -94,11 +94,14 @@ def test_pieces_hold_the_scenes_of_the_whole(tmp_path, by_car):
 
 
 def test_a_crowded_minute_is_several_pieces(tmp_path, monkeypatch):
-    """The scenes held do not grow with the traffic; they are the same."""
+    """The scenes held do not grow with the traffic; they are the same.
+
+    The last minute ends early: windows of it are empty, and no pieces.
+    """
     path = tmp_path / "log.csv"
-    spec = {**write(path, rows_of()), "long_bytes": 1}
+    spec = {**write(path, rows_of(seconds=135.0)), "long_bytes": 1}
     minutes = cuts(path, spec)
-    monkeypatch.setattr(long_logs, "MAX_ROWS", 2000)
+    monkeypatch.setattr(long_logs, "MAX_ROWS", 500)
     windows = cuts(path, spec)
     names = [made.name for made in windows]
     assert "log-00001.00" in names
@@ -242,16 +245,3 @@ def test_settings_change_the_digest_of_a_piece(tmp_path):
         scenes_of(first, CONFIG.collect).sha256
         != scenes_of(other, CONFIG.collect).sha256
     )
-
-
-def test_windows_without_rows_are_no_pieces(tmp_path, monkeypatch):
-    """A last minute that ends early, cut into windows of which some are empty."""
-    path = tmp_path / "log.csv"
-    spec = {**write(path, rows_of(seconds=135.0)), "long_bytes": 1}
-    whole = scenes_by_name(cuts(path, spec))
-    monkeypatch.setattr(long_logs, "MAX_ROWS", 200)
-    windows = cuts(path, spec)
-    assert set(scenes_by_name(windows)) == set(whole)
-    last = max(float(made.name.rpartition("-")[2]) for made in windows)
-    assert int(last) == 2
-    assert len({made.name for made in windows}) == len(windows)

@@ -17,7 +17,7 @@ from benchmarks.reliability.fuzz.forms import archive_of
 from benchmarks.reliability.fuzz.readers import suite
 from rcirl_jax.data.formats.interaction import reader as interaction
 from rcirl_jax.data.formats.l5 import map as l5_map
-from rcirl_jax.data.formats.levelx import map as levelx_lanes
+from rcirl_jax.data.formats.levelx import reader as levelx
 from rcirl_jax.data.formats.nuplan import map as nuplan_map
 from rcirl_jax.data.readers.sqlite import Database
 from rcirl_jax.data.readers.tables import table
@@ -335,7 +335,7 @@ def test_members_that_name_places_outside_are_not_unpacked(members, tmp_path):
     [
         lambda log, path: l5_map.find_map(log, {"map": path}),
         lambda log, path: interaction._find_map(log, {"map": path}),
-        lambda log, path: levelx_lanes.find_map(log, "1", {"map": path}),
+        lambda log, path: levelx._find_map(log, "1", {"map": path}),
         lambda log, path: nuplan_map.find_map(log, ["x"], {"maps": path}),
     ],
 )

@@ -50,14 +50,6 @@ def test_who_rides_is_decided_by_the_source(root, tmp_path):
     assert kinds["P13"] == Kind.PEDESTRIAN
 
 
-def test_what_a_toml_leaves_out_is_as_in_the_packaged_one(root, tmp_path):
-    source = tmp_path / "s.toml"
-    source.write_text('source = "mine"\n')
-    found, packaged = only(root, source), logs.packaged("interaction")
-    assert (found.source, found.licence) == ("mine", packaged["licence"])
-    assert found.rate_hz == packaged["rate_hz"]
-
-
 def test_inputs_from_the_release_down_to_a_file(root, scene):
     whole = only(root)
     for path in (root / "recorded_trackfiles", scene, scene / "vehicle_tracks_000.csv"):
@@ -140,11 +132,3 @@ def test_pedestrians_head_where_they_walk(root):
     assert (walker.length, walker.width) == (0.5, 0.5)
     np.testing.assert_allclose(walker.heading, 0.0, atol=1e-3)
     np.testing.assert_allclose(walker.speed, 1.3, atol=1e-3)
-
-
-def test_unknown_agents_are_vehicles(scene, root):
-    path = scene / "vehicle_tracks_000.csv"
-    path.write_text(path.read_text().replace(",car,", ",tram,"))
-    recording = only(root)
-    assert recording.tracks[0].kind == Kind.VEHICLE
-    assert "agent types taken for vehicles: tram" in recording.notes

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 
-from rcirl_jax.data.formats.levelx.map import marked_lanes
+from rcirl_jax.data.formats.levelx import reader
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
@@ -57,15 +57,6 @@ def test_carriageways_and_lane_numbers(motorway):
     assert (lanes["2"].left, lanes["2"].right) == ("3", None)
     assert (lanes["5"].left, lanes["5"].right) == (None, "6")
     assert lanes["6"].left == "5"
-
-
-def test_vehicles_are_on_the_lane_of_the_file(motorway):
-    recording = only(motorway)
-    centres = {lane.id: lane.centre[0, 1] for lane in recording.lanes}
-    for name, (_, _, lane, *_) in highd.road_users().items():
-        (track,) = [t for t in recording.tracks if t.id == name]
-        nearest = min(centres, key=lambda n: abs(centres[n] - track.y[0]))
-        assert nearest == str(lane)
 
 
 def test_direction_decides_the_heading_of_who_stands(motorway):
@@ -284,11 +275,16 @@ def test_classes(junction):
 
 def test_marked_lanes_longer_than_roads_are_not_made(tmp_path):
     marks = [";".join(f"{4 * k}" for k in range(a, a + 7)) for a in (0, 7)]
-    meta = {"upperLaneMarkings": marks[0], "lowerLaneMarkings": marks[1]}
-    rows = (np.zeros(1), np.ones(1))
-    assert len(marked_lanes(tmp_path, meta, (0.0, 400.0), None, rows)) == 12
+    cells = {"upperLaneMarkings": marks[0], "lowerLaneMarkings": marks[1]}
+    meta = reader._Meta(path=tmp_path, cells=cells)
+
+    def lanes(upper):
+        rows = {"x": np.array([0.0, upper]), "y": np.zeros(2), "vx": np.ones(2)}
+        return reader._marked_lanes(tmp_path, meta, rows, None)
+
+    assert len(lanes(400.0)) == 12
     with pytest.raises(InputError, match=r"lanes: 1\.18812e\+07 m long in all"):
-        marked_lanes(tmp_path, meta, (0.0, 9.9e5), None, rows)
+        lanes(9.9e5)
 
 
 def test_many_markings_are_read_in_full(motorway):

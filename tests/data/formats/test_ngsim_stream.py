@@ -114,7 +114,7 @@ def native(path, stamp=BEGIN["i-80"][0]):
 
 
 def test_pieces_of_the_native_text_are_those_of_the_csv(tmp_path, monkeypatch):
-    monkeypatch.setattr(streams, "READ_BYTES", 10_000)
+    monkeypatch.setattr(streams, "READ_CHARS", 10_000)
     path = native(tmp_path / "native.txt")
     rows = [line.split() for line in path.read_text().splitlines()]
     table = w.ngsim_csv(tmp_path / "native.csv", rows)

@@ -6,7 +6,7 @@ import functools
 import numpy as np
 import pytest
 
-from rcirl_jax.data.formats.paths import path_lanes
+from rcirl_jax.data.formats.lanes import path_lanes
 from rcirl_jax.errors import InputError
 from tests.data.formats.fixtures import openacc as fixture
 from tests.data.formats.fixtures.drives import straight
@@ -179,22 +179,6 @@ def test_long_drives_are_cut(tmp_path):
     assert sum(t.t.size for r in found for t in r.tracks) == 400 + 396 + 370
     whole = only(drive(tmp_path), spec(tmp_path, "block_s = 0.0\n"))
     assert whole.name == "part1"
-
-
-def test_far_places_are_moved(tmp_path):
-    columns = fixture.table(fixture.cars())
-    for car in (1, 2, 3):
-        for axis, shift in (("E", 51234.5), ("N", -3000.25)):
-            cells = columns[f"{axis}{car}"]
-            columns[f"{axis}{car}"] = [
-                f"{float(cell) + shift:.6f}" if cell else "" for cell in cells
-            ]
-    recording = only(drive(tmp_path, columns))
-    (note,) = [note for note in recording.notes if "local origin" in note]
-    assert note == "local origin at E = 52000 m, N = -3000 m"
-    assert recording.tracks[0].x[0] < 1000.0
-    centres = np.concatenate([lane.centre for lane in recording.lanes])
-    assert np.abs(centres).max() < 2000.0
 
 
 def lap(radius, turns, noise=0.0):

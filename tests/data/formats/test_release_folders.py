@@ -12,8 +12,6 @@ from tests.data.formats.fixtures import (
     format_of,
     interaction,
     interaction_challenge,
-    levelx,
-    levelx_highd,
     modules,
     nuplan,
     openacc,
@@ -122,14 +120,6 @@ def test_the_invented_scenario_of_interactions_scripts(tmp_path):
     assert names("interaction", tmp_path) == ["DR_A-000"]
     alone = tmp_path / "recorded_trackfiles" / ".TestScenarioForScripts"
     assert names("interaction", alone) == [".TestScenarioForScripts-000"]
-
-
-def test_levelx_releases_side_by_side(tmp_path):
-    levelx.write(tmp_path / "inD-dataset-v1.1")
-    highd = tmp_path / "highd-dataset-v1.0" / "data"
-    highd.mkdir(parents=True)
-    levelx_highd.write(highd)
-    assert names("levelx", tmp_path) == ["01", "07"]
 
 
 @pytest.mark.parametrize("writer", [interaction, interaction_challenge])

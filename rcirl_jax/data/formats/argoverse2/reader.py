@@ -26,7 +26,7 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from rcirl_jax.data.formats.files import files_matching
+from rcirl_jax.data.formats.files import files_below
 from rcirl_jax.data.formats.options import (
     kind_of,
     lane_types,
@@ -85,7 +85,7 @@ DRIVEN = ("VEHICLE", "BUS")  # read unless the source TOML says otherwise
 def parts(path: Path, spec: dict) -> list[Path]:
     """Lists the scenario files; each can be read alone."""
     wanted = patterns(spec, [f"{PREFIX}*{SUFFIX}"])
-    return files_matching(path, wanted, "scenario files")
+    return files_below(path, wanted, "scenario files")
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:

@@ -1,4 +1,4 @@
-"""Tables of any layout: `reader` for tracks, `map` for lane files beside them."""
+"""Tables of a user's own: `reader`, `columns`, `meaning`; `suggest` writes a TOML."""
 
 from rcirl_jax.data.formats.format import Format
 

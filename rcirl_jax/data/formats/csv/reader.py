@@ -5,6 +5,7 @@ coordinates and clocks lose their origin here, in float64: the package computes
 in float32 later.
 """
 
+import collections
 import dataclasses
 import itertools
 from collections.abc import Iterator
@@ -12,16 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.formats.csv.map import (
-    LIMIT_MPS,
-    LogTable,
-    lane_file_of,
-    lanes_of,
-)
-from rcirl_jax.data.formats.csv.mapping import Mapping, mapping_of
+from rcirl_jax.data.formats.csv.columns import LogColumns, columns_of
 from rcirl_jax.data.formats.csv.meaning import Meaning, meaning_of
-from rcirl_jax.data.formats.csv.users import track_of
-from rcirl_jax.data.formats.declared import open_log
+from rcirl_jax.data.formats.declared import open_log, track_of
 from rcirl_jax.data.formats.files import (
     firsts_of_a_name,
     is_input,
@@ -29,16 +23,23 @@ from rcirl_jax.data.formats.files import (
     log_name,
     table_stem,
 )
-from rcirl_jax.data.formats.options import number, patterns
-from rcirl_jax.data.formats.projection import projected
+from rcirl_jax.data.formats.lanes import (
+    LANE_WIDTH_M,
+    StraightLane,
+    lane_file_of,
+    lanes_of_toml,
+    path_lanes,
+    straight_lanes,
+)
+from rcirl_jax.data.formats.options import KINDS, number, patterns, section, stated
 from rcirl_jax.data.formats.shapes import local_origin, origin_notes
-from rcirl_jax.data.formats.tracks import split_tracks
+from rcirl_jax.data.formats.tracks import spans_of, split_tracks
 from rcirl_jax.data.readers.long_logs import rows_of
-from rcirl_jax.data.readers.tables.rows import RowStats, attach_row_stats
+from rcirl_jax.data.readers.tables.rows import Rows, RowStats, attach_row_stats
 from rcirl_jax.data.readers.tables.table import Table
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Recording
+from rcirl_jax.types import Kind, Lane, Recording, Track
 
 PATTERNS = (
     *("*.csv", "*.csv.gz", "*.csv.zst", "*.csv.bz2"),
@@ -46,45 +47,32 @@ PATTERNS = (
 )  # of files that are read; of those called alike the first pattern's
 MAX_GAP_STEPS = 5.5  # missing rows bridged inside one track
 STILL_M = 0.5  # m; a log in which all road users stay within it is in degrees
+# box centre ahead of the recorded position, in box lengths
+REFERENCE = {"centre": 0.0, "front": -0.5, "rear": 0.5}
+SIZE_M = {"length": 4.5, "width": 1.8}  # m, a car
+MARGIN_M = 50.0  # m of fitted lane beyond the first and last position
+LIMIT_MPS = 29.06  # m/s, 65 mph
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Log:
-    """One file, its mapping and what becomes of its rows."""
+    """One file, its columns and what becomes of its rows."""
 
     table: Table
     spec: dict
-    mapping: Mapping
+    columns: LogColumns
     stats: RowStats
 
-    @property
-    def path(self) -> Path:
-        """The file."""
-        return self.table.path
-
-    @property
-    def name(self) -> str:
-        """Name of its recording, or what its recordings' names begin with."""
-        return log_name(self.path, self.spec, own_name(self.path))
-
-    def metres(self, points: np.ndarray) -> np.ndarray:
-        """Positions [n, 2] of the file in metres."""
-        if self.mapping.middle is None:
-            return points
-        degrees = points * self.mapping.degrees
-        east, north = projected(degrees[:, 0], degrees[:, 1], self.mapping.middle)
-        return np.stack([east, north], axis=1)
-
-    def placed(self, rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Rows with x and y in metres."""
-        if self.mapping.middle is None:
+    def placed(self, rows: Rows) -> Rows:
+        """Returns rows with x and y in metres."""
+        if self.columns.middle is None:
             return rows
-        x, y = self.metres(np.stack([rows["x"], rows["y"]], axis=1)).T
+        x, y = self.columns.metres(np.stack([rows["x"], rows["y"]], axis=1)).T
         return {**rows, "x": x, "y": y}
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The tables; each can be read alone.
+    """Returns the tables; each can be read alone.
 
     Of files in one folder with one name that of the first pattern counts: it is the
     same log.
@@ -108,7 +96,7 @@ own_name = table_stem  # of a log, as long as no other folder has one called ali
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per file, or per value of the `recording` column.
+    """Yields one Recording per file, or per value of the `recording` column.
 
     Of a file too long for memory one per minute.
     """
@@ -119,73 +107,140 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
 
 
 def opened(file: Path, spec: dict) -> Log:
-    """A file with its mapping, none of whose rows is read."""
+    """Opens a file with its columns; none of its rows is read."""
     table, stats = open_log(file, spec)
-    return Log(table=table, spec=spec, mapping=mapping_of(table, spec), stats=stats)
+    return Log(table=table, spec=spec, columns=columns_of(table, spec), stats=stats)
 
 
 def _recordings(log: Log, is_long: bool) -> Iterator[Recording]:
-    fields, gap_s = log.mapping.fields, MAX_GAP_STEPS / log.mapping.rate_hz
+    path, columns = log.table.path, log.columns
+    own = log_name(path, log.spec, own_name(path))
     with rows_of(
         log.table,
-        fields,
+        columns.fields,
         log.stats,
         is_long=is_long,
-        distance=log.mapping.distance,
-        is_clock=log.mapping.is_clock,
+        distance=columns.distance,
+        is_clock=columns.is_clock,
     ) as rows:
         every = rows.recordings()
         minutes = (log.placed(part) for one in every for part in rows.minutes(one))
         automated = rows.texts_of("automated")
-        meaning = meaning_of(log.path, minutes, automated, log.mapping, log.spec)
+        meaning = meaning_of(path, minutes, automated, columns, log.spec)
         for recording in every:
-            name = log.name if recording is None else f"{log.name}-{recording}"
-            for piece in rows.slices(recording, gap_s):
-                table = _localise(log, log.placed(piece.values), meaning)
-                made = _recording(f"{name}{piece.label}", table, log, meaning)
-                yield piece.of_log(name, made)
+            name = own if recording is None else f"{own}-{recording}"
+            for part in rows.slices(recording, MAX_GAP_STEPS / columns.rate_hz):
+                values = meaning.applied(log.placed(part.values))
+                made = _recording(f"{name}{part.label}", values, log, meaning)
+                yield part.of_log(name, made)
 
 
-def _localise(log: Log, values: dict[str, np.ndarray], meaning: Meaning) -> LogTable:
-    """Move far coordinates near the origin."""
-    values = meaning.applied(values)
-    x, y = values["x"], values["y"]
-    span = max(np.ptp(x), np.ptp(y))
-    if not log.mapping.has_units and 0.0 < span < STILL_M:
+def _recording(name: str, values: Rows, log: Log, meaning: Meaning) -> Recording:
+    path, spec, columns = log.table.path, log.spec, log.columns
+    span = max(np.ptp(values["x"]), np.ptp(values["y"]))
+    if not columns.has_units and 0.0 < span < STILL_M:
         raise InputError(
-            f"{log.path}: x, y: all within {span:.3g} m: expected road users that move;"
+            f"{path}: x, y: all within {span:.3g} m: expected road users that move;"
             ' longitude and latitude? say units.x = "deg", units.y = "deg"'
         )
-    origin = local_origin(x, y)
-    return LogTable(
-        path=log.path,
-        values={**values, "x": x - origin[0], "y": y - origin[1]},
-        rate_hz=log.mapping.rate_hz,
-        origin=origin,
-        notes=(*log.mapping.notes, *meaning.notes, *origin_notes(origin)),
-        metres=log.metres,
-    )
-
-
-def _recording(name: str, table: LogTable, log: Log, meaning: Meaning) -> Recording:
-    spec, values = log.spec, table.values
-    gap_s = MAX_GAP_STEPS / table.rate_hz
+    origin = local_origin(values["x"], values["y"])
+    places = np.stack([values["x"], values["y"]], axis=1) - origin
+    values = {**values, "x": places[:, 0], "y": places[:, 1]}
+    gap_s = MAX_GAP_STEPS / columns.rate_hz
     # rows may come in any order
-    places = np.stack([values["x"], values["y"]], axis=1)
     pieces = split_tracks(
-        table.path, values["id"], values["t"], gap_s, reuse=0.0, places=places
+        path, values["id"], values["t"], gap_s, reuse=0.0, places=places
     )
     tracks = tuple(
-        track_of(label, table, rows, spec, meaning) for label, rows in pieces
+        _track(label, {n: column[rows] for n, column in values.items()}, log, meaning)
+        for label, rows in pieces
     )
-    lanes, notes = lanes_of(table, spec, tracks)
+    lanes, notes = _lanes(values, tracks, log, origin)
     return Recording(
         name=name,
         source=str(spec.get("source", "CSV log")),
         licence=str(spec.get("licence", "unknown")),
-        rate_hz=table.rate_hz,
+        rate_hz=columns.rate_hz,
         tracks=tracks,
         lanes=lanes,
         default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
-        notes=(*table.notes, *notes),
+        notes=(*columns.notes, *meaning.notes, *origin_notes(origin), *notes),
     )
+
+
+def _track(name: str, rows: Rows, log: Log, meaning: Meaning) -> Track:
+    """A track of some rows; what they do not say is that of [defaults]."""
+    spec, usual = log.spec, section(log.spec, "defaults")
+    texts = rows.get("kind", np.zeros(1, str))
+    found = str(texts[0])
+    if np.any(texts != found):  # the most frequent one that is known
+        known = collections.Counter(texts[texts != ""].tolist())
+        found = known.most_common(1)[0][0]
+    found = found or str(usual.get("kind", ""))
+    kind = str(section(spec, "kinds").get(found, found or "vehicle")).lower()
+    if kind not in KINDS:
+        raise InputError(
+            f"{log.table.path}: id {name}: kind: {found}: expected one of "
+            f"{', '.join(KINDS)}, or an entry in [kinds]"
+        )
+    reference = spec.get("reference_point", "centre")
+    if reference not in REFERENCE:
+        raise InputError(
+            f"source TOML: reference_point: {reference}: "
+            f"expected one of {', '.join(REFERENCE)}"
+        )
+    automated = np.zeros(rows["t"].size, bool)
+    if "automated" in rows:
+        automated = meaning.automated(rows["automated"])
+    length, width = (number(usual, field, size) for field, size in SIZE_M.items())
+    spans = spans_of(rows["t"], automated)
+    made = track_of(name, rows, Kind[kind.upper()], (length, width), automated=spans)
+    ahead = REFERENCE[reference] * made.length
+    return dataclasses.replace(
+        made,
+        x=made.x + ahead * np.cos(made.heading),
+        y=made.y + ahead * np.sin(made.heading),
+    )
+
+
+def _lanes(
+    values: Rows, tracks: tuple[Track, ...], log: Log, origin: np.ndarray
+) -> tuple[tuple[Lane, ...], list[str]]:
+    """The lanes given; else straight ones from the lane column; else paths."""
+    path, spec = log.table.path, log.spec
+    given = lanes_of_toml(path, spec, lambda p: log.columns.metres(p) - origin)
+    if given:
+        return given, []
+    limit = stated(spec, "speed_limit")
+    width = number(spec, "lane_width_m", LANE_WIDTH_M)
+    found = _straight(values, tracks, width) if "lane" in values else None
+    if found:
+        lanes = straight_lanes(path, found, width, limit)
+        return lanes, ["straight lanes fitted to the lane column"]
+    lanes = path_lanes(tracks, width, limit)
+    return lanes, [f"no lanes given; {len(lanes)} fitted to the longest paths"]
+
+
+def _straight(
+    values: Rows, tracks: tuple[Track, ...], width: float
+) -> list[StraightLane] | None:
+    """Lanes parallel to the x axis, or None where the rows of one are not."""
+    x, y, names = (values[field] for field in ("x", "y", "lane"))
+    towards = {t.id.split("#")[0]: float(t.x[-1] - t.x[0]) for t in tracks}
+    travel = np.array([towards.get(str(i), 0.0) for i in values["id"]])
+    found = []
+    for name in np.unique(names[names != ""]):
+        rows = names == name
+        centre = float(np.median(y[rows]))
+        if np.median(np.abs(y[rows] - centre)) > 0.5 * width:
+            return None
+        found.append(
+            StraightLane(
+                id=str(name),
+                y=centre,
+                lower=float(x[rows].min()) - MARGIN_M,
+                upper=float(x[rows].max()) + MARGIN_M,
+                forward=bool(np.median(travel[rows]) >= 0.0),
+            )
+        )
+    return found

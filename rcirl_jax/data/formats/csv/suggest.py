@@ -5,41 +5,42 @@ The TOML is read back like any other: what is shown is what an import would take
 """
 
 import dataclasses
+import json
 import math
 import re
-from collections.abc import Mapping as AnyMapping
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.formats.csv.dates import date_pattern
-from rcirl_jax.data.formats.csv.flags import NO, YES
-from rcirl_jax.data.formats.csv.heading import half_seconds, is_large
-from rcirl_jax.data.formats.csv.mapping import (
+from rcirl_jax.data.formats.csv.columns import (
     ALLOWED_UNITS,
     DEGREES,
     HOLE,
     NEEDED,
     OPTIONAL,
     RATE_HZ,
-    Mapping,
+    LogColumns,
+    date_pattern,
     first_cell,
     known_cells,
     sampled,
 )
-from rcirl_jax.data.formats.csv.meaning import Meaning, meaning_of, with_velocity
-from rcirl_jax.data.formats.csv.names import fields_by_name, kind_by_name, unit_of
-from rcirl_jax.data.formats.csv.reader import opened
-from rcirl_jax.data.formats.csv.suggestion import (
-    Guess,
-    recognised,
-    shown,
-    toml_of,
-    unknown,
+from rcirl_jax.data.formats.csv.meaning import (
+    CONVENTION,
+    NO,
+    YES,
+    Meaning,
+    half_seconds,
+    is_large,
+    meaning_of,
+    with_velocity,
 )
+from rcirl_jax.data.formats.csv.names import fields_by_name, kind_by_name, unit_of
+from rcirl_jax.data.formats.csv.reader import PATTERNS, opened
+from rcirl_jax.data.formats.files import table_stem
 from rcirl_jax.data.formats.options import KINDS, UNITS
-from rcirl_jax.data.readers.tables.rows import LINE
+from rcirl_jax.data.readers.tables.rows import LINE, Rows
 from rcirl_jax.data.readers.tables.table import MAX_TIME, Table, batches, open_table
 from rcirl_jax.data.readers.tables.text import NUMBER
 from rcirl_jax.errors import InputError, as_input_error
@@ -51,6 +52,22 @@ NO_RATE = "rate_hz: rows per second of one road user; 10 is assumed"
 LONG_CAR_M = 9.0  # m; a longer median vehicle was measured in feet
 # recorded speed over that of the positions, both in m/s if it were m/s
 SPEED_RATIOS = {"m/s": 1.0, "km/h": 3.6, "ft/s": 3.2808, "mph": 2.2369, "kn": 1.9438}
+ROWS_SHOWN = 5
+SHOWN = ("t", "id", "x", "y", "heading", "speed", "length", "width", "kind", "lane")
+SHOWN_UNITS = {
+    **dict.fromkeys(("x", "y", "length", "width"), "m"),
+    **{"t": "s", "heading": "deg", "speed": "m/s"},
+}
+INSTEAD = {
+    **{"heading": "by the positions", "speed": "by the positions"},
+    **{"length": "4.5 m for all", "width": "1.8 m for all"},
+    **{"kind": "all are vehicles", "lane": "lanes along the paths driven"},
+}  # field -> what is taken where no column says it
+NEVER_KNOWN = (
+    "speed_limit: 29.06 m/s (65 mph) until you say better",
+    "reference_point: the centre of the box is assumed",
+    "source, licence: yours to fill in",
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,44 +78,65 @@ class Suggestion:
     lines: tuple[str, ...]  # for the terminal
 
 
+@dataclasses.dataclass(kw_only=True)
+class _Guess:
+    """The options of a source TOML so far."""
+
+    columns: dict[str, str]
+    said: list[str]
+    units: dict[str, str] = dataclasses.field(default_factory=dict)
+    scale: dict[str, float] = dataclasses.field(default_factory=dict)
+    kinds: dict[str, str] = dataclasses.field(default_factory=dict)
+    rate_hz: float | None = None
+    open: list[str] = dataclasses.field(default_factory=list)  # what is not known
+
+    def spec(self) -> dict:
+        """As the TOML's content."""
+        rate = {} if self.rate_hz is None else {"rate_hz": self.rate_hz}
+        parts = ("columns", "units", "scale", "kinds")
+        options = {name: getattr(self, name) for name in parts}
+        return {**options, "max_bad_rows": 0.5, **rate}
+
+
 def suggested(path: Path) -> Suggestion:
-    """A source TOML by the head of a table.
+    """Returns a source TOML by the head of a table.
 
     Raises:
       InputError: no table, or one without columns that look like time, id and places.
     """
     with as_input_error(str(path), "a table with a row per road user and time"):
-        return _suggested(path)
+        table = open_table(path)
+        guess = _guess_columns(table)
+        _guess_time_form(table, guess)
+        raw = _first_rows(path, guess.spec())
+        _guess_clock(table, raw, guess)
+        _guess_lengths(table, raw, guess)
+        _guess_heading_and_speed(table, raw, guess)
+        _guess_texts(raw, guess)
+        rows, meaning, columns = _without_wrong_headings(path, guess)
+        lines = _in_words(table, guess, (*columns.notes, *meaning.notes))
+        lines += ["", "the first rows as understood:", *_shown(rows)]
+        return Suggestion(toml=_toml_of(path, guess, meaning), lines=tuple(lines))
 
 
-def _suggested(path: Path) -> Suggestion:
-    table = open_table(path)
-    columns, said = _columns(table)
-    guess = Guess(columns=columns, said=said)
-    _time_form(table, guess)
-    _check_degrees(table, guess)
-    raw = _first_rows(path, guess.spec())
-    _clock(table, raw, guess)
-    _lengths(table, raw, guess)
-    _heading_and_speed(table, raw, guess)
-    _texts(raw, guess)
-    rows, meaning, mapping = _without_wrong_headings(path, guess)
-    lines = [
-        *recognised(table, guess, mapping, meaning),
-        *unknown(table, guess),
-        "",
-        "the first rows as understood:",
-        *shown(rows),
-    ]
-    return Suggestion(toml=toml_of(path, guess, meaning), lines=tuple(lines))
-
-
-def _columns(table: Table) -> tuple[dict[str, str], list[str]]:
+def _guess_columns(table: Table) -> _Guess:
     """Field -> column, and how a table with a row per frame was told."""
     found, said = fields_by_name(table.header), []
-    wide = _wide(table)
-    alone = {field for field in found if _alone(table, found[field])}
-    if wide and not {"id", "x", "y"} <= alone:
+    bare = [re.sub(r"\d+", "", name) for name in table.header]
+    forms: list[str] = []  # {id} for the number in a name
+    for name in table.header:
+        match = re.fullmatch(r"(\D*)(\d+)(\D*)", name)
+        if match and (match[1] or match[3]):
+            forms.append(f"{match[1]}{HOLE}{match[3]}")
+    several = {f.replace(HOLE, "_"): f for f in forms if forms.count(f) > 1}
+    wide = {
+        field: several[name]
+        for field, name in fields_by_name(list(several)).items()
+        if field in (*NEEDED, *OPTIONAL) and field not in ("t", "id")
+    }
+    # columns from which no other differs by a number only
+    alone = {f for f, n in found.items() if bare.count(re.sub(r"\d+", "", n)) == 1}
+    if {"x", "y"} <= wide.keys() and not {"id", "x", "y"} <= alone:
         found = {k: v for k, v in found.items() if k == "t"} | wide
         said.append(f"a row per frame: {wide['x']}, {wide['y']} for each road user")
     places = ("lat", "lon") if "lat" in found else ("x", "y")
@@ -109,51 +147,29 @@ def _columns(table: Table) -> tuple[dict[str, str], list[str]]:
             f"{table.path}: no column looks like {', '.join(missing)}: expected them "
             f"among {[n for n in table.header if n][:40]}; write the TOML by hand"
         )
-    return found, said
+    return _Guess(columns=found, said=said)
 
 
-def _alone(table: Table, column: str) -> bool:
-    """Whether no other column differs by a number only."""
-    plain = re.sub(r"\d+", "", column)
-    alike = [name for name in table.header if re.sub(r"\d+", "", name) == plain]
-    return len(alike) == 1
-
-
-def _wide(table: Table) -> dict[str, str]:
-    """Columns x, y and more with {id} for the number in their names; {} if none."""
-    forms: dict[str, int] = {}
-    for name in table.header:
-        match = re.fullmatch(r"(\D*)(\d+)(\D*)", name)
-        if match and (match[1] or match[3]):
-            form = f"{match[1]}{HOLE}{match[3]}"
-            forms[form] = forms.get(form, 0) + 1
-    several = [form for form, count in forms.items() if count > 1]
-    bare = {form.replace(HOLE, "_"): form for form in several}
-    fields = fields_by_name(list(bare))
-    found = {field: bare[name] for field, name in fields.items()}
-    found = {k: v for k, v in found.items() if k in (*NEEDED, *OPTIONAL) and k != "id"}
-    found.pop("t", None)
-    return found if {"x", "y"} <= found.keys() else {}
-
-
-def _first_rows(path: Path, spec: AnyMapping) -> dict[str, np.ndarray]:
+def _first_rows(path: Path, spec: Mapping) -> Rows:
     """Rows of the first MiB as a source TOML takes them, texts as text."""
     log = opened(path, dict(spec))
-    for batch in batches(log.table, log.mapping.fields, log.stats):
-        rows = {
-            name: np.array(column[1])[column[0]]
-            if isinstance(column, tuple)
-            else column
-            for name, column in batch.items()
-        }
-        if rows[LINE].size:
-            return rows
+    for batch in batches(log.table, log.columns.fields, log.stats):
+        if batch[LINE].size:
+            return {
+                name: np.array(c[1])[c[0]] if isinstance(c, tuple) else c
+                for name, c in batch.items()
+            }
     log.stats.check()
     raise InputError(f"{path}: rows: none: expected rows below the header")
 
 
-def _time_form(table: Table, guess: Guess) -> None:
-    """Unit of times that are no seconds, milliseconds or frames: by the first cell."""
+def _guess_time_form(table: Table, guess: _Guess) -> None:
+    """Unit of times that are no seconds, milliseconds or frames: by the first cell.
+
+    Raises:
+      InputError: latitudes are no degrees; of raw numbers nobody knows how many make
+        one.
+    """
     first = first_cell(table, guess.columns["t"])
     if re.match(r"\d{4}[-/]\d|\d{8}T\d|\d{1,2}:\d", first):
         guess.units["t"] = "iso"
@@ -161,14 +177,6 @@ def _time_form(table: Table, guess: Guess) -> None:
         guess.units["t"] = "ns" if float(first) > 1e3 * MAX_TIME else "us"
     elif pattern := date_pattern(known_cells(table, guess.columns["t"])):
         guess.units["t"] = pattern
-
-
-def _check_degrees(table: Table, guess: Guess) -> None:
-    """Latitudes are degrees; of raw numbers nobody knows how many make one.
-
-    Raises:
-      InputError: they are too large.
-    """
     found = sampled(table, guess.columns["lat"]) if "lat" in guess.columns else None
     if found is not None and found.size and np.abs(found).min() > DEGREES["y"]:
         raise InputError(
@@ -178,7 +186,7 @@ def _check_degrees(table: Table, guess: Guess) -> None:
         )
 
 
-def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None:
+def _guess_clock(table: Table, raw: Rows, guess: _Guess) -> None:
     """Unit of the time and rows per second, by the step of the road users' times."""
     ids = np.unique(raw["id"], return_inverse=True)[1]
     order = np.lexsort((raw["t"], ids))
@@ -186,8 +194,12 @@ def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None
     steps = steps[steps > 0.0]
     step = float(np.median(steps)) if steps.size else math.nan
     if "t" not in guess.units:
-        name = guess.columns["t"]
-        unit = _said(table, name, ("ms", "us", "ns", "s")) or _unit_by_step(name, step)
+        name, possible = guess.columns["t"], ("s", "ms", "us", "ns", "day")
+        unit = _said_unit(table, name, ("ms", "us", "ns", "s"))
+        if not unit and "frame" in name.lower() and step == round(step) < 10:
+            unit = "frame"
+        fitting = (u for u in possible if 0.005 <= step * UNITS[u] <= 2.0)
+        unit = unit or next(fitting, "s")
         if unit == "frame" and step > 1.0:
             guess.scale["t"] = 1.0 / step
             guess.said.append(f"scale.t: every {step:g}th frame has rows")
@@ -203,109 +215,88 @@ def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None
     )
 
 
-def _said(table: Table, column: str, allowed: Sequence[str]) -> str:
+def _said_unit(table: Table, column: str, allowed: Sequence[str]) -> str:
     """The unit that a column's name says, or the line below the header."""
     bare = column.removeprefix("-")
     own = "" if HOLE in bare else table.unit_of(bare)
     return unit_of(column, allowed) or unit_of(f"[{own}]", allowed)
 
 
-def _unit_by_step(name: str, step: float) -> str:
-    """Unit of a clock whose rows are so far apart."""
-    if "frame" in name.lower() and step == round(step) < 10:
-        return "frame"
-    for unit in ("s", "ms", "us", "ns", "day"):
-        if 0.005 <= step * UNITS[unit] <= 2.0:
-            return unit
-    return "s"
-
-
-def _lengths(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None:
+def _guess_lengths(table: Table, raw: Rows, guess: _Guess) -> None:
     """Units of places and sizes: as their names say, else metres if cars fit them."""
     if "lat" in guess.columns:
         guess.units.update({"lat": "deg", "lon": "deg"})
     known = raw.get("length", np.zeros(0))
     known = known[np.isfinite(known)]
-    long = bool(known.size) and float(np.median(known)) > LONG_CAR_M
+    is_long = bool(known.size) and float(np.median(known)) > LONG_CAR_M
     for field in ("x", "y", "length", "width"):
         if field in guess.columns:
-            said = _said(table, guess.columns[field], ALLOWED_UNITS["length"])
-            guess.units[field] = said or ("ft" if long else "m")
-    if long:
+            said = _said_unit(table, guess.columns[field], ALLOWED_UNITS["length"])
+            guess.units[field] = said or ("ft" if is_long else "m")
+    if is_long:
         guess.said.append(f"length: {np.median(known):.3g} in the median: feet")
 
 
-def _heading_and_speed(
-    table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess
-) -> None:
+def _guess_heading_and_speed(table: Table, raw: Rows, guess: _Guess) -> None:
     """Units of angles by their size; of speeds by the speed of the positions."""
     if "heading" in guess.columns:
-        large = is_large(raw["heading"][np.isfinite(raw["heading"])])
-        said = _said(table, guess.columns["heading"], ("deg", "rad"))
-        guess.units["heading"] = said or ("deg" if large else "rad")
+        said = _said_unit(table, guess.columns["heading"], ("deg", "rad"))
+        by_size = "deg" if is_large(raw["heading"]) else "rad"
+        guess.units["heading"] = said or by_size
     speeds = [field for field in ("speed", "vx", "vy") if field in guess.columns]
-    said = {f: _said(table, guess.columns[f], ALLOWED_UNITS["speed"]) for f in speeds}
-    guess.units.update({field: said[field] or "m/s" for field in speeds})
+    allowed = ALLOWED_UNITS["speed"]
+    units = {f: _said_unit(table, guess.columns[f], allowed) for f in speeds}
+    guess.units.update({field: units[field] or "m/s" for field in speeds})
     told = ["speed"] if "speed" in speeds else speeds  # by which the speed is known
     if told == ["vy"] or told == ["vx"] or not told:
         return
-    if guess.rate_hz is None:
-        _rate_of_frames(table.path, guess)
-    if not any(said[field] for field in told):
-        unit = _speed_unit(table.path, guess) or "m/s"
-        guess.units.update(dict.fromkeys(told, unit))
-
-
-def _speed_unit(path: Path, guess: Guess) -> str:
-    """The unit in which speeds are those of the positions; "" if none is."""
-    ratio = _speed_ratio(path, guess)
-    if ratio is None:
-        return ""
+    is_said = any(units[field] for field in told)
+    ratio = None
+    if guess.rate_hz is None or not is_said:
+        ratio = _speed_ratio(table.path, guess)
+    if guess.rate_hz is None and ratio is not None:
+        # the usual rate at which frames are apart as recorded speeds say, if one is
+        for unit, times in SPEED_RATIOS.items():
+            rate = RATE_HZ * ratio / times
+            near = min(USUAL_RATES, key=lambda usual: abs(rate / usual - 1.0))
+            if abs(rate / near - 1.0) < FRAMES_FIT:
+                guess.rate_hz = near
+                guess.open.remove(NO_RATE)
+                guess.said.append(
+                    f"rate_hz = {near:g}: by the speeds, if they are in {unit}"
+                )
+                ratio = None if is_said else _speed_ratio(table.path, guess)
+                break
+    if is_said or ratio is None:
+        return
     unit = min(SPEED_RATIOS, key=lambda name: abs(ratio / SPEED_RATIOS[name] - 1.0))
     if abs(ratio / SPEED_RATIOS[unit] - 1.0) > 0.06:
         guess.open.append(f"units.speed: {ratio:.3g} times the speed of the positions")
-        return ""
-    guess.said.append(f"units.speed = {unit}: {ratio:.3g} times the positions' m/s")
-    return unit
+        unit = "m/s"
+    else:
+        guess.said.append(f"units.speed = {unit}: {ratio:.3g} times the positions' m/s")
+    guess.units.update(dict.fromkeys(told, unit))
 
 
-def _speed_ratio(path: Path, guess: Guess) -> float | None:
+def _speed_ratio(path: Path, guess: _Guess) -> float | None:
     """Recorded speed over that of the positions; None: too few road users move."""
-    rows, _, mapping = _without_wrong_headings(path, guess)
-    first, _, last = half_seconds(rows, mapping.rate_hz)
+    rows, _, columns = _without_wrong_headings(path, guess)
+    first, _, last = half_seconds(rows, columns.rate_hz)
     dx, dy, dt = (rows[name][last] - rows[name][first] for name in ("x", "y", "t"))
     real, found = np.hypot(dx, dy) / np.maximum(dt, 1e-9), rows["speed"][first]
     used = (real > 2.0) & np.isfinite(found)
-    return (
-        float(np.median(np.abs(found[used]) / real[used])) if used.sum() > 9 else None
-    )
+    if used.sum() <= 9:
+        return None
+    return float(np.median(np.abs(found[used]) / real[used]))
 
 
-def _rate_of_frames(path: Path, guess: Guess) -> None:
-    """The usual rate at which frames are apart as recorded speeds say, if one is."""
-    ratio = _speed_ratio(path, guess)
-    if ratio is None:
-        return
-    for unit, times in SPEED_RATIOS.items():
-        rate = RATE_HZ * ratio / times
-        near = min(USUAL_RATES, key=lambda usual: abs(rate / usual - 1.0))
-        if abs(rate / near - 1.0) < FRAMES_FIT:
-            guess.rate_hz = near
-            guess.open.remove(NO_RATE)
-            guess.said.append(
-                f"rate_hz = {near:g}: by the speeds, if they are in {unit}"
-            )
-            return
-
-
-def _texts(raw: AnyMapping[str, np.ndarray], guess: Guess) -> None:
+def _guess_texts(raw: Rows, guess: _Guess) -> None:
     """Kinds by their names; flags only where they are yes or no."""
-    if "kind" in guess.columns:
-        for text in np.unique(raw["kind"]).tolist():
-            if text and text not in KINDS:
-                guess.kinds[text] = kind_by_name(text) or "vehicle"
-                if not kind_by_name(text):
-                    guess.open.append(f"kinds: {text}: taken for a vehicle")
+    for text in np.unique(raw.get("kind", [])).tolist():
+        if text and text not in KINDS:
+            guess.kinds[text] = kind_by_name(text) or "vehicle"
+            if not kind_by_name(text):
+                guess.open.append(f"kinds: {text}: taken for a vehicle")
     if "automated" in guess.columns:
         texts = {text.lower() for text in np.unique(raw["automated"]).tolist()}
         if not texts <= {"", "0", "1", *YES, *NO}:
@@ -313,8 +304,8 @@ def _texts(raw: AnyMapping[str, np.ndarray], guess: Guess) -> None:
 
 
 def _without_wrong_headings(
-    path: Path, guess: Guess
-) -> tuple[dict[str, np.ndarray], Meaning, Mapping]:
+    path: Path, guess: _Guess
+) -> tuple[Rows, Meaning, LogColumns]:
     """What is understood, by the positions where headings contradict them."""
     try:
         return _understood(path, guess.spec())
@@ -327,14 +318,109 @@ def _without_wrong_headings(
         return _understood(path, guess.spec())
 
 
-def _understood(
-    path: Path, spec: AnyMapping
-) -> tuple[dict[str, np.ndarray], Meaning, Mapping]:
+def _understood(path: Path, spec: dict) -> tuple[Rows, Meaning, LogColumns]:
     """First rows in SI units, as an import takes them."""
-    log = opened(path, dict(spec))
-    rows = _first_rows(path, spec)
-    points = log.metres(np.stack([rows["x"], rows["y"]], axis=1))
-    rows = {**rows, "x": points[:, 0], "y": points[:, 1]}
+    log = opened(path, spec)
+    rows = log.placed(_first_rows(path, spec))
     texts = np.unique(rows.get("automated", np.zeros(0, str))).tolist()
-    meaning = meaning_of(path, [rows], texts, log.mapping, dict(spec))
-    return with_velocity(meaning.applied(rows)), meaning, log.mapping
+    meaning = meaning_of(path, [rows], texts, log.columns, spec)
+    return with_velocity(meaning.applied(rows)), meaning, log.columns
+
+
+def _in_words(table: Table, guess: _Guess, notes: Sequence[str]) -> list[str]:
+    """What was recognised and what is not known, a line each."""
+    columns, layout = guess.columns, table.layout
+    found = ["Parquet or Feather" if layout is None else layout.in_words()]
+    for field, column in columns.items():
+        unit = f", {guess.units[field]}" if field in guess.units else ""
+        found.append(f"{field}: column {column}{unit}")
+    if {"vx", "vy"} <= columns.keys():
+        columns = {"heading": "", "speed": "", **columns}
+    missing = [f"{f}: no column; {i}" for f, i in INSTEAD.items() if f not in columns]
+    used = [re.escape(n).replace(re.escape(HOLE), ".+") for n in columns.values() if n]
+    unused = [
+        name
+        for name in table.header
+        if name and not any(re.fullmatch(form, name) for form in used)
+    ]
+    return [
+        *(f"recognised: {line}" for line in (*found, *guess.said, *notes)),
+        *(f"not known: {line}" for line in (*guess.open, *missing, *NEVER_KNOWN)),
+        *([f"not used: {', '.join(unused)}"] if unused else []),
+    ]
+
+
+def _shown(rows: Rows) -> list[str]:
+    """The first rows as a table: m, m/s, degrees."""
+    names = [name for name in SHOWN if name in rows]
+    origin = rows["t"].min()
+    cells = [[f"{n} [{SHOWN_UNITS[n]}]" if n in SHOWN_UNITS else n for n in names]]
+    for row in np.argsort(rows[LINE], kind="stable")[:ROWS_SHOWN]:
+        cells.append([])
+        for name in names:
+            value = rows[name][row]
+            if name == "t":
+                value = value - origin
+            elif name == "heading":
+                value = float(np.rad2deg(np.angle(np.exp(1j * value))))
+            text = str(value)
+            if isinstance(value, float):
+                text = "" if math.isnan(value) else f"{value:.2f}"
+            cells[-1].append(text or "unknown")
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return [
+        "  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True))
+        for row in cells
+    ]
+
+
+TOML = """\
+# How {name} is read, as names and first rows suggest. Every option:
+# data_specs/sources/csv_example.toml
+source = {source}
+licence = "unknown"                    # of the data
+pattern = {pattern}
+speed_limit = 29.06                    # m/s, where a lane has none
+lane_width_m = 3.5                     # m
+reference_point = "centre"             # what x, y point at, or front, rear
+max_bad_rows = 0.01                    # share of rows that may be dropped
+{convention}
+[columns]
+{columns}
+
+[units]
+{units}
+{scale}
+[defaults]
+rate_hz = {rate:g}
+length = 4.5                           # m, where nothing is known
+width = 1.8                            # m
+kind = "vehicle"
+{kinds}"""
+
+
+def _toml_of(path: Path, guess: _Guess, meaning: Meaning) -> str:
+    """The text of the source TOML, whose texts JSON writes alike."""
+
+    def text(value: str) -> str:
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+    def lines(values: Mapping[str, str]) -> str:
+        return "\n".join(f"{name} = {text(value)}" for name, value in values.items())
+
+    form = meaning.form  # of headings; said where it is not as usual
+    own = path.name.removeprefix(table_stem(path))
+    ending = own if f"*{own}" in PATTERNS else path.name.removeprefix(path.stem)
+    scale = "\n".join(f"{name} = {value!r}" for name, value in guess.scale.items())
+    kinds = lines({text(name): kind for name, kind in guess.kinds.items()})
+    return TOML.format(
+        name=path.name,
+        source=text(table_stem(path)),
+        pattern=text(f"*{ending}"),
+        convention=f'{CONVENTION} = "{form.name}"\n' if form and form.note else "",
+        columns=lines(guess.columns),
+        units=lines(guess.units),
+        scale=f"\n[scale]\n{scale}\n" if scale else "",
+        rate=guess.rate_hz or 10.0,
+        kinds=f"\n[kinds]\n{kinds}\n" if kinds else "",
+    )

@@ -21,44 +21,33 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.formats.declared import (
-    KINDS,
-    Columns,
-    Rows,
-    open_log,
-    unknown_kinds,
-)
-from rcirl_jax.data.formats.files import (
-    given_map,
-    input_files,
-    is_input,
-    log_name,
-)
+from rcirl_jax.data.formats.declared import KINDS, open_log, track_of, unknown_kinds
+from rcirl_jax.data.formats.files import files_below, given_map, is_input, log_name
 from rcirl_jax.data.formats.lanelet2.map import read_lanelet2
+from rcirl_jax.data.formats.lanes import path_lanes
 from rcirl_jax.data.formats.options import number
-from rcirl_jax.data.formats.paths import path_lanes
 from rcirl_jax.data.formats.perception import SIZES_M
 from rcirl_jax.data.formats.projection import utm, utm_zone
-from rcirl_jax.data.formats.tracks import split_tracks, travel_heading
+from rcirl_jax.data.formats.tracks import split_tracks
 from rcirl_jax.data.readers.tables.rows import (
     LINE,
     NoRowsError,
+    Rows,
     RowStats,
     attach_row_stats,
     drop_duplicates,
 )
-from rcirl_jax.data.readers.tables.table import open_table, read
+from rcirl_jax.data.readers.tables.table import fields_of, open_table, read
 from rcirl_jax.data.recording import accepted, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Track
 
-TABLE = Columns(
-    needed={
-        **{"track_id": "text", "timestamp_ms": "time", "agent_type": "text"},
-        **{"x": "place", "y": "place", "vx": "speed", "vy": "speed"},
-    },
-    optional=dict.fromkeys(("case_id", "psi_rad", "length", "width"), "number"),
-    t="timestamp_ms",
+NEEDED = {
+    **{"track_id": "text", "timestamp_ms": "time", "agent_type": "text"},
+    **{"x": "place", "y": "place", "vx": "speed", "vy": "speed"},
+}
+OPTIONAL: dict[str, str] = dict.fromkeys(
+    ("case_id", "psi_rad", "length", "width"), "number"
 )
 VEHICLES = "vehicle_tracks_"
 PEDESTRIANS = "pedestrian_tracks_"
@@ -84,7 +73,7 @@ class _Scene:
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per vehicle file, or per case of a challenge file."""
+    """Yields one Recording per vehicle file, or per case of a challenge file."""
     for file in parts(path, spec):
         rows, stats = _read(file, spec)
         scene, all_stats = _scene(file, spec), [stats]
@@ -107,7 +96,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The log files below a folder, no other tables; pedestrians with vehicles."""
+    """Returns the log files below a folder; pedestrians come with vehicles."""
     if path.is_file():
         return [path]
     tables = sorted(file for file in path.rglob("*.csv") if is_input(path, file))
@@ -119,7 +108,7 @@ def parts(path: Path, spec: dict) -> list[Path]:
         if not file.name.startswith(PEDESTRIANS)
         or file.with_name(file.name.replace(PEDESTRIANS, VEHICLES, 1)) not in names
     ]
-    return kept or input_files(path, "**/*.csv")
+    return kept or files_below(path, "**/*.csv")
 
 
 def _is_log(path: Path) -> bool:
@@ -136,7 +125,7 @@ def _is_log(path: Path) -> bool:
 
 
 def own_name(file: Path) -> str:
-    """Name of a log, as long as no other folder has one called alike."""
+    """Returns the name of a log, as long as no other folder has one called alike."""
     if not file.name.startswith((VEHICLES, PEDESTRIANS)):
         return file.stem
     number_ = file.stem.removeprefix(VEHICLES).removeprefix(PEDESTRIANS)
@@ -154,13 +143,13 @@ def _scene_name(path: Path) -> str:
 
 
 def _read(path: Path, spec: dict) -> tuple[Rows, RowStats]:
-    """All columns this module uses, and what became of the rows.
+    """All columns this module uses, and counts of the rows.
 
     NaN where a file or a cell has none; a road user is one of a case.
     """
     table, stats = open_log(path, spec)
-    rows = read(table, TABLE.fields(table), stats)
-    rows = dict.fromkeys(TABLE.optional, np.full(rows[LINE].size, np.nan)) | rows
+    rows = read(table, fields_of(table, NEEDED, OPTIONAL), stats)
+    rows = dict.fromkeys(OPTIONAL, np.full(rows[LINE].size, np.nan)) | rows
     unknown = ~np.isfinite(rows["case_id"])
     if table.has("case_id") and unknown.any():
         line = rows[LINE][unknown][0]
@@ -172,8 +161,8 @@ def _read(path: Path, spec: dict) -> tuple[Rows, RowStats]:
     def name_of(user: float) -> str:
         return str(users[int(user) % users.size])
 
-    rows = drop_duplicates(rows, stats, t=TABLE.t, user="user", name_of=name_of)
-    return rows, stats
+    options = {"t": "timestamp_ms", "user": "user", "name_of": name_of}
+    return drop_duplicates(rows, stats, **options), stats
 
 
 def _scene(path: Path, spec: dict) -> _Scene:
@@ -232,55 +221,38 @@ def _cases(table: Rows, scene: _Scene) -> Iterator[Recording]:
         yield accepted(make, name, scene.path, scene.spec)
 
 
-def _recording(name: str, table: Rows, scene: _Scene, group: str | None) -> Recording:
-    stamps = table["timestamp_ms"]
-    table["t"] = (stamps - stamps.min()) / 1000.0
-    pieces = split_tracks(scene.path, table["track_id"], stamps, MAX_GAP_MS)
-    notes = list(scene.notes)
-    tracks = tuple(_track(label, rows, table, scene) for label, rows in pieces)
-    kinds = set(np.unique(table["agent_type"])) - {EITHER}
-    notes += unknown_kinds("agent types", kinds)
+def _recording(name: str, rows: Rows, scene: _Scene, group: str | None) -> Recording:
+    stamps, spec = rows["timestamp_ms"], scene.spec
+    rows["t"] = (stamps - stamps.min()) / 1000.0
+    rows["speed"] = np.hypot(rows["vx"], rows["vy"])
+    tracks = tuple(
+        _track(label, {field: rows[field][at] for field in rows}, scene)
+        for label, at in split_tracks(scene.path, rows["track_id"], stamps, MAX_GAP_MS)
+    )
     lanes = scene.lanes
     if lanes is None:
-        width = number(scene.spec, "lane_width_m")
-        lanes = path_lanes(tracks, width, None)
+        lanes = path_lanes(tracks, number(spec, "lane_width_m"), None)
+    kinds = set(np.unique(rows["agent_type"])) - {EITHER}
     return Recording(
         name=name,
-        source=scene.spec["source"],
-        licence=scene.spec["licence"],
-        rate_hz=number(scene.spec, "rate_hz"),
+        source=spec["source"],
+        licence=spec["licence"],
+        rate_hz=number(spec, "rate_hz"),
         tracks=tracks,
         lanes=lanes,
         group=group,
         default_speed_limit=scene.limit,
-        notes=tuple(notes),
+        notes=(*scene.notes, *unknown_kinds("agent types", kinds)),
     )
 
 
-def _track(name: str, rows: np.ndarray, table: Rows, scene: _Scene) -> Track:
-    t, x, y, psi = (table[field][rows] for field in ("t", "x", "y", "psi_rad"))
-    speed = np.hypot(table["vx"][rows], table["vy"][rows])
-    agent = str(table["agent_type"][rows[0]]).lower()
+def _track(name: str, rows: Rows, scene: _Scene) -> Track:
+    agent = str(rows["agent_type"][0]).lower()
     kind = KINDS.get(agent, Kind.VEHICLE)
     if agent == EITHER:
         fast = number(scene.spec, "cyclist_speed_mps")
-        rides = float(np.percentile(speed, 90.0)) > fast
+        rides = float(np.percentile(rows["speed"], 90.0)) > fast
         kind = Kind.CYCLIST if rides else Kind.PEDESTRIAN
-    sizes, guessed = [], False
-    for field, default in zip(("length", "width"), SIZES_M[kind], strict=True):
-        known = table[field][rows]
-        known = known[np.isfinite(known) & (known > 0.0)]
-        sizes.append(float(np.median(known)) if known.size else default)
-        guessed |= not known.size
-    return Track(
-        id=name,
-        kind=kind,
-        length=sizes[0],
-        width=sizes[1],
-        size_assumed=guessed,
-        t=t,
-        x=x,
-        y=y,
-        heading=psi if np.isfinite(psi).all() else travel_heading(t, x, y),
-        speed=speed,
-    )
+    if np.isfinite(rows["psi_rad"]).all():
+        rows["heading"] = rows["psi_rad"]
+    return track_of(name, rows, kind, SIZES_M[kind])

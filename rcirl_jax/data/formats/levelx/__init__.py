@@ -1,4 +1,4 @@
-"""levelXData (highD, inD, rounD, exiD, uniD): `reader` for tracks, `map` for lanes."""
+"""levelXData (highD, inD, rounD, exiD, uniD): `reader` for tracks and lanes."""
 
 from rcirl_jax.data.formats.format import Format, of_columns
 

@@ -14,6 +14,7 @@ degrees, moved by the recording's UTM origin, a trailer is a track of its own.
 """
 
 import dataclasses
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -21,19 +22,19 @@ import numpy as np
 
 from rcirl_jax.data.formats.declared import (
     KINDS,
-    Columns,
-    Rows,
     open_log,
+    read_log,
+    size_of,
+    track_of,
     unknown_kinds,
 )
-from rcirl_jax.data.formats.files import files_below, log_name
+from rcirl_jax.data.formats.files import files_below, given_map, log_name
 from rcirl_jax.data.formats.lanelet2.map import read_lanelet2
-from rcirl_jax.data.formats.levelx.map import find_map, marked_lanes
+from rcirl_jax.data.formats.lanes import StraightLane, parallel_lane, path_lanes
 from rcirl_jax.data.formats.options import number
-from rcirl_jax.data.formats.paths import path_lanes
 from rcirl_jax.data.formats.projection import utm, utm_zone
-from rcirl_jax.data.formats.tracks import split_tracks, travel_heading
-from rcirl_jax.data.readers.tables.rows import RowStats, attach_row_stats
+from rcirl_jax.data.formats.tracks import split_tracks
+from rcirl_jax.data.readers.tables.rows import Rows, RowStats, attach_row_stats
 from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
     Table,
@@ -41,38 +42,27 @@ from rcirl_jax.data.readers.tables.table import (
     open_table,
     read,
 )
-from rcirl_jax.data.recording import check_span, validate_recording
+from rcirl_jax.data.recording import check_lanes_length, check_span, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Track
 
 SUFFIX, USERS, META = "_tracks.csv", "_tracksMeta.csv", "_recordingMeta.csv"
-MOVES = {"vx": "speed", "vy": "speed"}
-CORNER = Columns(
-    needed={
-        **{"frame": "time", "id": "number", "x": "place", "y": "place"},
-        **{"length": "place", "width": "place", **MOVES},
-    },
-    called={"length": "width", "width": "height", "vx": "xVelocity", "vy": "yVelocity"},
-    t="frame",
-    name_of="{:g}".format,
-)
-CENTRE = Columns(
-    needed={
-        **{"frame": "time", "id": "number", "x": "place", "y": "place"},
-        **{"heading": "number", "width": "place", "length": "place", **MOVES},
-    },
-    called={
-        **{"id": "trackId", "x": "xCenter", "y": "yCenter"},
-        **{"vx": "xVelocity", "vy": "yVelocity"},
-    },
-    t="frame",
-    name_of="{:g}".format,
-)
+NEEDED = {
+    **{"frame": "time", "id": "number", "x": "place", "y": "place"},
+    **{"length": "place", "width": "place", "vx": "speed", "vy": "speed"},
+}
+VELOCITY = {"vx": "xVelocity", "vy": "yVelocity"}
+CORNER = {"length": "width", "width": "height", **VELOCITY}  # highD's columns
+CENTRE = {"id": "trackId", "x": "xCenter", "y": "yCenter", **VELOCITY}
 LIFE = ("numFrames", "initialFrame", "finalFrame")  # of a track, in tracksMeta
 MAX_GAP_FRAMES = 5.5  # frames missing inside one track
 MAX_ID = 2**53  # beyond it float64 does not count
 FAR_M = 200.0  # m; a map that far from all tracks is not theirs
 SIZE_M = (0.5, 0.5)  # m, length and width of a road user without a box
+MARGIN_M = 50.0  # m of lane beyond the first and last position
+MAP_FOLDERS = ("maps", "lanelets", "lanelet2")
+# highD: the upper carriageway is driven towards -x, the lower towards +x
+SIDES = {"upper": -1.0, "lower": 1.0}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -92,13 +82,13 @@ class _Meta:
     cells: Mapping[str, str]
 
     def number(self, field: str, limit: float = np.inf) -> float:
-        """A number, finite and within a limit."""
-        found = self.cells.get(field, "missing")[:40]
+        """Returns a number, finite and within a limit."""
         try:
             value = float(self.cells.get(field, "nan"))
         except ValueError:
             value = float("nan")
         if not (np.isfinite(value) and abs(value) <= limit):
+            found = self.cells.get(field, "missing")[:40]
             kind = "finite number" if limit == np.inf else f"number within {limit:g}"
             raise InputError(f"{self.path}: {field}: '{found}': expected a {kind}")
         return value
@@ -123,17 +113,17 @@ class _Meta:
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The XX_tracks.csv at any depth of a folder: releases keep them in data/."""
+    """Returns XX_tracks.csv at any depth of a folder: releases keep them in data/."""
     return files_below(path, "*" + SUFFIX)
 
 
 def own_name(file: Path) -> str:
-    """Name of a log, as long as no other folder has one called alike."""
+    """Returns the name of a log, as long as no other folder has one called alike."""
     return file.name.removesuffix(SUFFIX)
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per XX_tracks.csv."""
+    """Yields one Recording per XX_tracks.csv."""
     for file in parts(path, spec):
         if not file.name.endswith(SUFFIX):
             raise InputError(f"{file}: name: {file.name}: expected XX{SUFFIX}")
@@ -142,17 +132,72 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
         yield validate_recording(attach_row_stats(made, stats), file)
 
 
-def _other(path: Path, suffix: str) -> Path:
-    """The name of the same recording's file with another ending."""
-    return path.with_name(path.name.removesuffix(SUFFIX) + suffix)
-
-
 def _beside(path: Path, suffix: str) -> Path:
     """The file of the same recording with another ending."""
-    other = _other(path, suffix)
+    other = path.with_name(own_name(path) + suffix)
     if not other.is_file():
         raise InputError(f"{other}: input: missing: expected it beside {path.name}")
     return other
+
+
+def _recording(table: Table, spec: dict, stats: RowStats) -> Recording:
+    """Boxes by their corners (highD), or by their centres (inD and its sisters)."""
+    path, is_corner = table.path, "xCenter" not in table.header
+    columns = CORNER if is_corner else CENTRE
+    needed = NEEDED if is_corner else {**NEEDED, "heading": "number"}
+    options = {"t": "frame", "name_of": "{:g}".format}
+    rows = read_log(table, stats, needed, columns=columns, **options)
+    direction = "drivingDirection" if is_corner else None
+    users = _read_users(_beside(path, USERS), columns.get("id", "id"), direction)
+    meta = _read_meta(_beside(path, META))
+    rate, limit = meta.rate, meta.limit
+    rows["t"] = (rows["frame"] - rows["frame"].min()) / rate
+    rows["speed"] = np.hypot(rows["vx"], rows["vy"])
+    if is_corner:
+        rows["x"] = rows["x"] + 0.5 * rows["length"]
+        rows["y"] = -(rows["y"] + 0.5 * rows["width"])
+    else:
+        rows["heading"] = np.deg2rad(rows["heading"])
+    ids = _ids(path, rows, users, spec)
+    tracks = [
+        _track(name, {n: rows[n][part] for n in rows}, users[int(ids[part[0]])], spec)
+        for name, part in split_tracks(path, ids, rows["frame"], MAX_GAP_FRAMES)
+    ]
+    if not spec.get("partial", False):
+        _check_whole(path, ids, rows["frame"], users)
+    if is_corner:
+        lanes, notes = _marked_lanes(path, meta, rows, limit), []
+    else:
+        lanes, notes = _mapped_lanes(path, meta, tracks, spec)
+    met = set(ids.tolist())
+    missing = len(set(users) - met)
+    notes += [f"{missing} tracks of tracksMeta have no rows"] if missing else []
+    notes += unknown_kinds("classes", {user.kind for user in users.values()})
+    if trailers := sum(users[number].kind == "trailer" for number in met):
+        notes += [f"{trailers} trailers are obstacles of kind cyclist, no experts"]
+    default = number(spec, "default_speed_limit")
+    return Recording(
+        name=log_name(path, spec, own_name(path)),
+        source=spec["source"],
+        licence=spec["licence"],
+        rate_hz=rate,
+        tracks=tuple(tracks),
+        lanes=lanes,
+        default_speed_limit=limit if limit is not None else default,
+        notes=tuple(notes),
+    )
+
+
+def _track(name: str, rows: Rows, user: _User, spec: dict) -> Track:
+    """One road user without a gap; without a box it has no heading either."""
+    usual = spec.get("sizes", {}).get(user.kind, SIZE_M)
+    kind = KINDS.get(user.kind, Kind.VEHICLE)
+    standing = np.pi if user.direction == 1.0 else 0.0
+    heading = rows.get("heading")
+    if heading is not None and size_of(rows, usual)[2] and np.ptp(heading) == 0.0:
+        standing = float(heading[0])
+        del rows["heading"]
+    return track_of(name, rows, kind, usual, standing=standing)
 
 
 def _read_meta(path: Path) -> _Meta:
@@ -167,99 +212,28 @@ def _read_meta(path: Path) -> _Meta:
     return _Meta(path=path, cells=dict(zip(table.header, texts, strict=True)))
 
 
-def _recording(table: Table, spec: dict, stats: RowStats) -> Recording:
-    """Boxes by their corners (highD), or by their centres (inD and its sisters)."""
-    path, is_corner = table.path, "xCenter" not in table.header
-    columns = CORNER if is_corner else CENTRE
-    rows = columns.read(table, stats)
-    direction = "drivingDirection" if is_corner else None
-    users = _read_users(_beside(path, USERS), columns.called.get("id", "id"), direction)
-    meta = _read_meta(_beside(path, META))
-    rate = meta.rate
-    rows["t"] = (rows["frame"] - rows["frame"].min()) / rate
-    if is_corner:
-        rows["x"] = rows["x"] + 0.5 * rows["length"]
-        rows["y"] = -(rows["y"] + 0.5 * rows["width"])
-    ids, pieces = _pieces(path, rows["id"], rows["frame"], users, spec)
-    tracks = [
-        _track(name, {n: rows[n][part] for n in rows}, users[int(ids[part[0]])], spec)
-        for name, part in pieces
-    ]
-    limit = meta.limit
-    if is_corner:
-        check_span(str(path), "x", rows["x"])
-        along = (float(rows["x"].min()), float(rows["x"].max()))
-        velocities = (rows["y"], rows["vx"])
-        lanes = marked_lanes(meta.path, meta.cells, along, limit, velocities)
-        notes = []
-    else:
-        lanes, notes = _mapped_lanes(path, meta, tracks, spec)
-    default = number(spec, "default_speed_limit")
-    return Recording(
-        name=log_name(path, spec, own_name(path)),
-        source=spec["source"],
-        licence=spec["licence"],
-        rate_hz=rate,
-        tracks=tuple(tracks),
-        lanes=lanes,
-        default_speed_limit=limit if limit is not None else default,
-        notes=(*notes, *_user_notes(set(ids.tolist()), users)),
-    )
-
-
-def _track(name: str, rows: Rows, user: _User, spec: dict) -> Track:
-    """One road user without a gap."""
-    t, x, y = rows["t"], rows["x"], rows["y"]
-    size = [float(np.median(rows[field])) for field in ("length", "width")]
-    is_boxed = min(size) > 0.0
-    if not is_boxed:
-        default = spec.get("sizes", {}).get(user.kind, SIZE_M)
-        size = [
-            found or float(given) for found, given in zip(size, default, strict=True)
-        ]
-    heading, standing = None, np.pi if user.direction == 1.0 else 0.0
-    if "heading" in rows:
-        heading = np.deg2rad(rows["heading"])
-        standing = float(heading[0])
-    # a road user without a box has no heading either
-    if heading is None or (not is_boxed and np.ptp(heading) == 0.0):
-        heading = travel_heading(t, x, y, standing)
-    return Track(
-        id=name,
-        kind=KINDS.get(user.kind, Kind.VEHICLE),
-        length=size[0],
-        width=size[1],
-        size_assumed=not is_boxed,
-        t=t,
-        x=x,
-        y=y,
-        heading=heading,
-        speed=np.hypot(rows["vx"], rows["vy"]),
-    )
-
-
 def _read_users(path: Path, key: str, direction: str | None) -> dict[int, _User]:
     """Track number -> what tracksMeta says of it."""
     rows, *ends = LIFE
     wanted = {key: "number", "class": "text", **dict.fromkeys(ends, "number")}
     wanted |= {direction: "number"} if direction else {}
     source = open_table(path)
-    fields = fields_of(source, wanted, {rows: "number"})
+    fields = fields_of(source, wanted, {rows: "number"}, lower=True)
     table = read(source, fields, RowStats(path=path, allowed=0.0))
     first, last = (table[end] for end in ends)
     lives = zip(table.get(rows, last - first + 1.0), first, last, strict=True)
     towards = table[direction] if direction else np.zeros(table[key].size)
-    kinds = np.char.lower(table["class"])
     return {
         int(name): _User(kind=str(kind), direction=float(way), life=life)
-        for name, kind, way, life in zip(table[key], kinds, towards, lives, strict=True)
+        for name, kind, way, life in zip(
+            table[key], table["class"], towards, lives, strict=True
+        )
     }
 
 
-def _pieces(
-    path: Path, names: np.ndarray, frames: np.ndarray, users: dict, spec: dict
-) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]]:
-    """Track numbers per row, and the rows of each track without a gap."""
+def _ids(path: Path, rows: Rows, users: dict[int, _User], spec: dict) -> np.ndarray:
+    """Track numbers [n], each of which tracksMeta knows."""
+    names = rows["id"]
     wrong = np.flatnonzero((names != np.round(names)) | (np.abs(names) > MAX_ID))
     if wrong.size:
         raise InputError(
@@ -269,13 +243,10 @@ def _pieces(
     unknown = sorted(set(np.unique(ids).tolist()) - set(users))
     if unknown:
         raise InputError(
-            f"{path}: track {unknown[0]}: no row in {_other(path, USERS).name}: "
+            f"{path}: track {unknown[0]}: no row in {own_name(path)}{USERS}: "
             "expected one per track"
         )
-    pieces = split_tracks(path, ids, frames, MAX_GAP_FRAMES)
-    if not spec.get("partial", False):
-        _check_whole(path, ids, frames, users)
-    return ids, pieces
+    return ids
 
 
 def _check_whole(
@@ -292,27 +263,66 @@ def _check_whole(
             if value != expected:
                 raise InputError(
                     f"{path}: track {name}: {field}: {value:.12g}: expected "
-                    f"{expected:.12g} as in {_other(path, USERS).name}; truncated "
+                    f"{expected:.12g} as in {own_name(path)}{USERS}; truncated "
                     "file? (of a sample, set partial = true in the source TOML)"
                 )
 
 
-def _user_notes(met: set[int], users: dict[int, _User]) -> list[str]:
-    """Tracks without rows, classes that this module does not know, and trailers."""
-    missing = len(set(users) - met)
-    notes = [f"{missing} tracks of tracksMeta have no rows"] if missing else []
-    notes += unknown_kinds("classes", {user.kind for user in users.values()})
-    trailers = sum(users[number].kind == "trailer" for number in met)
-    if trailers:
-        notes.append(f"{trailers} trailers are obstacles of kind cyclist, no experts")
-    return notes
+def _marked_lanes(
+    path: Path, meta: _Meta, rows: Rows, limit: float | None
+) -> tuple[Lane, ...]:
+    """highD: straight lanes between the markings, named as `laneId` names them.
+
+    A carriageway is driven the way its rows are.
+    """
+    check_span(str(path), "x", rows["x"])
+    lower, upper = float(rows["x"].min()), float(rows["x"].max())
+    sides = {side: _markings(meta, f"{side}LaneMarkings") for side in SIDES}
+    count = sum(marks.size - 1 for marks in sides.values())
+    check_lanes_length(str(meta.path), count * (upper - lower + 2.0 * MARGIN_M))
+    lanes: list[Lane] = []
+    first = 2  # lane 1 lies above the first marking
+    for side, marks in sides.items():
+        inside = (rows["y"] <= marks[0]) & (rows["y"] >= marks[-1])
+        travel = np.median(rows["vx"][inside]) if inside.any() else SIDES[side]
+        names = range(first, first + marks.size - 1)
+        for name, above, below in zip(names, marks, marks[1:], strict=False):
+            # the lane above (smaller number) is to the left of one driven towards +x
+            around = [name - 1, name + 1] if travel > 0.0 else [name + 1, name - 1]
+            lane = StraightLane(
+                id=str(name),
+                y=0.5 * (above + below),
+                lower=lower - MARGIN_M,
+                upper=upper + MARGIN_M,
+                forward=bool(travel > 0.0),
+            )
+            half = 0.5 * (above - below)
+            ids = [str(n) if n in names else None for n in around]
+            lanes.append(parallel_lane(lane, (half, half), ids, limit))
+        first += marks.size
+    return tuple(lanes)
+
+
+def _markings(meta: _Meta, field: str) -> np.ndarray:
+    """[m] m, y of the markings from top to bottom (y up)."""
+    text = meta.cells.get(field, "")
+    try:
+        marks = -np.array([float(mark) for mark in text.split(";") if mark.strip()])
+    except ValueError:
+        marks = np.zeros(0)
+    if marks.size < 2 or not np.isfinite(marks).all() or np.any(np.diff(marks) >= 0.0):
+        raise InputError(
+            f"{meta.path}: {field}: '{text[:60]}': expected at least two increasing "
+            "numbers separated by ;"
+        )
+    return marks
 
 
 def _mapped_lanes(
     path: Path, meta: _Meta, tracks: list[Track], spec: dict
 ) -> tuple[tuple[Lane, ...], list[str]]:
     """Lanes of the location's Lanelet2 map; else fitted to the paths driven."""
-    place = find_map(path, meta.cells.get("locationId", ""), spec)
+    place = _find_map(path, meta.cells.get("locationId", ""), spec)
     why = "no map found"
     if place is not None:
         zone = utm_zone(meta.number("lonLocation", 180.0))
@@ -324,6 +334,47 @@ def _mapped_lanes(
         if min(apart) < FAR_M:
             return lanes, notes
         why = f"{place.name} lies elsewhere"
-    width = number(spec, "lane_width_m")
-    lanes = path_lanes(tracks, width, None)
+    lanes = path_lanes(tracks, number(spec, "lane_width_m"), None)
     return lanes, [f"{why}; {len(lanes)} lanes fitted to the longest paths"]
+
+
+def _find_map(path: Path, location: str, spec: dict) -> Path | None:
+    """The Lanelet2 map of a recording's location, or None.
+
+    The releases keep maps/lanelets/04_aseag/location4.osm (or
+    lanelets/location4.osm) beside the folder `data`. The option `map` names a
+    file, or a folder to look into.
+    """
+    if (given := given_map(spec)) is not None:
+        if given.is_file():
+            return given
+        return _of_location(sorted(given.rglob("*.osm")), location)
+    folder = path.resolve().parent
+    for place in (folder, folder.parent):
+        folders = [place / name for name in MAP_FOLDERS]
+        found = [file for inside in folders for file in sorted(inside.rglob("*.osm"))]
+        match = _of_location([*sorted(place.glob("*.osm")), *found], location)
+        if match is not None:
+            return match
+    return None
+
+
+def _of_location(files: list[Path], location: str) -> Path | None:
+    """locationN.osm; else the only map in a folder named N_..., N_*.osm, *_N.osm."""
+    digits = location.split(".")[0].lstrip("0") or "0"
+    if not digits.isdigit():
+        return None
+    patterns = (
+        (rf"location_?0*{digits}", "stem"),
+        (rf"0*{digits}_.*", "parent"),
+        (rf"0*{digits}_.*", "stem"),
+        (rf".*_0*{digits}", "stem"),
+    )
+    for pattern, part in patterns:
+        for file in files:
+            if part == "parent" and file.stem.lower().startswith("location"):
+                continue
+            name = file.parent.name if part == "parent" else file.stem
+            if re.fullmatch(pattern, name, flags=re.IGNORECASE):
+                return file
+    return None

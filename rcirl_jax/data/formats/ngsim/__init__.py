@@ -1,10 +1,10 @@
-"""NGSIM trajectory tables: `reader`, and `map` for the lanes of each site."""
+"""NGSIM trajectory tables: `reader`."""
 
 from rcirl_jax.data.formats.format import Format, of_columns
 
 FORMAT = Format(
     columns=of_columns("vehicle_id frame_id local_y v_vel lane_id"),
-    told_by="native",
+    told_by="reader",
     is_cut=True,
     is_declared=True,
     options={"long_bytes": 0, "table": {}},

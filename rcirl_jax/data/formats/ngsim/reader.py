@@ -16,53 +16,75 @@ arterials have no column Location to say what they are, but 24 columns.
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.formats.declared import Columns, Rows, open_log
+from rcirl_jax.data.formats.declared import open_log, size_of, track_of
 from rcirl_jax.data.formats.files import (
+    files_below,
     firsts_of_a_name,
-    input_files,
     is_input,
     is_long_file,
     log_name,
     table_stem,
 )
-from rcirl_jax.data.formats.ngsim.map import (
-    MAX_FRAME_GAP,
-    SITE,
-    Survey,
-    site_recording,
+from rcirl_jax.data.formats.lanes import StraightLane, straight_lanes
+from rcirl_jax.data.formats.options import (
+    number,
+    patterns,
+    positive,
+    section,
+    unit_factor,
 )
-from rcirl_jax.data.formats.options import patterns, positive, section, unit_factor
+from rcirl_jax.data.formats.tracks import spans_of, split_tracks
 from rcirl_jax.data.readers.long_logs import rows_of
-from rcirl_jax.data.readers.tables.rows import RowStats, attach_row_stats
-from rcirl_jax.data.readers.tables.table import Field, Table, batches
+from rcirl_jax.data.readers.tables.rows import Rows, RowStats, attach_row_stats
+from rcirl_jax.data.readers.tables.table import Field, Table, batches, fields_of
 from rcirl_jax.data.readers.tables.text import BLANKS
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Recording
+from rcirl_jax.types import Kind, Lane, Recording, Track
 
-CLOCK = "Global_Time"
-COLUMNS = {
-    **{"Vehicle_ID": "count", "Frame_ID": "time", "Local_Y": "place"},
-    **{"v_Vel": "place", "Lane_ID": "count"},
-    **{"Local_X": "place", "v_Length": "place", "v_Width": "place"},
-    **{"v_Class": "count", CLOCK: "time", "Preceding": "count", SITE: "text"},
-}  # column -> what its cells are
-NEEDED = tuple(COLUMNS)[:5]
-OPTIONAL = tuple(COLUMNS)[5:-1]
-APART = ("Preceding",)  # columns in which rows that repeat each other may differ
-PLACES = ("Local_Y", "Local_X")  # where a road user is
+CLOCK, SITE = "Global_Time", "Location"
+NEEDED = {
+    "id": ("Vehicle_ID", "count"),
+    "t": ("Frame_ID", "time"),
+    "along": ("Local_Y", "place"),
+    "speed": ("v_Vel", "place"),
+    "lane": ("Lane_ID", "count"),
+}  # field -> its column, and what the cells are
+OPTIONAL = {
+    "across": ("Local_X", "place"),
+    "length": ("v_Length", "place"),
+    "width": ("v_Width", "place"),
+    "class": ("v_Class", "count"),
+    "leader": ("Preceding", "count"),
+}
 JUNCTION = "Int_ID"  # a column of arterials, empty for freeways
-ARTERIAL_COLUMNS = 24  # of an arterial's native text
+NATIVE_COLUMNS, ARTERIAL_COLUMNS = 18, 24  # of texts without a header
 LOGS = "trajectories"  # start of the logs' names in the releases
+MAX_FRAME_GAP = 1  # frames; a larger gap starts a new track
+REUSE_S = 60.0  # s; a step back by more is a number given to another vehicle
+MARGIN_M = 50.0  # m of lane beyond the first and last position
+SIZE_M = (4.5, 1.8)  # m, a car
+
+
+def is_log(file: Path, table: Table | None) -> bool:
+    """Whether it is a text of 18 numbers a line, with blanks between them."""
+    del file
+    return (
+        table is not None
+        and table.layout is not None
+        and table.layout.delimiter == BLANKS
+        and len(table.header) == NATIVE_COLUMNS
+        and not any(c.isalpha() for cell in table.header for c in cell)
+    )
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The text and CSV files; each can be read alone.
+    """Returns the text and CSV files; each can be read alone.
 
     In folders below only those called trajectories*. Of files in one folder with
     one name that of the first pattern counts: it is the same log.
@@ -78,19 +100,93 @@ def parts(path: Path, spec: dict) -> list[Path]:
         and is_input(path, file)
         and "notice" not in file.name.lower()
     )
-    return sorted(found) or input_files(path, " or ".join(wanted))
+    return sorted(found) or files_below(path, " or ".join(wanted))
 
 
 own_name = table_stem  # of a log, as long as no other folder has one called alike
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per file and site; of a long file, per site and minute."""
+    """Yields one Recording per file and site; of a long file, per site and minute."""
     for file in parts(path, spec):
         table, stats = _open(file, spec)
         stats.repeats_are_bad = False  # the portal's files hold some
         for made in _recordings(table, spec, stats):
             yield validate_recording(attach_row_stats(made, stats), file)
+
+
+def _open(path: Path, spec: dict) -> tuple[Table, RowStats]:
+    """The portal's table, or the native text, whose columns the TOML names.
+
+    Raises:
+      InputError: a column is missing, or it is an arterial's file.
+    """
+    table, stats = open_log(path, spec)
+    is_known = any(table.has(column) for column, _ in NEEDED.values())
+    is_numeric = not any(c.isalpha() for c in "".join(table.header))
+    if (
+        table.layout is not None
+        and not is_known
+        and (is_numeric or table.layout.delimiter == BLANKS)
+    ):
+        columns = spec.get("columns", [])
+        if not isinstance(columns, list) or not all(
+            isinstance(name, str) for name in columns
+        ):
+            raise InputError(
+                f"source TOML: columns: {columns}: expected a list of names"
+            )
+        for name, _ in NEEDED.values():
+            if name not in columns:
+                raise InputError(f"source TOML: columns: {name}: missing: expected it")
+        if len(table.header) == ARTERIAL_COLUMNS != len(columns):
+            raise InputError(
+                f"{path}: line 1: {len(table.header)} cells: expected {len(columns)}; "
+                "arterials have no straight lanes"
+            )
+        options = {"names": columns, "skip": 0, **section(spec, "table")}
+        table, stats = open_log(path, {**spec, "table": options})
+    if table.has(JUNCTION) and not table.has(SITE):
+        raise InputError(
+            f"{path}: column {SITE}: missing: expected it beside {JUNCTION}; "
+            "arterials have no straight lanes"
+        )
+    return table, stats
+
+
+def _has_stamps(table: Table) -> bool:
+    """Whether Global_Time [ms] is the clock: positive, and not one for all rows."""
+    if not table.has(CLOCK):
+        return False
+    if any(cell and not cell.strip("0.") for cell in table.samples(CLOCK)):
+        return False  # nothing else is read where the first rows say 0
+    lowest, highest = np.inf, -np.inf
+    fields, uncounted = fields_of(table, {CLOCK: "time"}), RowStats(path=table.path)
+    for part in batches(table, fields, uncounted):
+        if part[CLOCK].size:
+            lowest = min(lowest, part[CLOCK].min())
+            highest = max(highest, part[CLOCK].max())
+        if lowest <= 0.0:
+            return False
+    return bool(highest > lowest)
+
+
+def _fields(table: Table, spec: dict, stamped: bool) -> list[Field]:
+    """Columns that are read, in SI units; those that may be missing are, if there."""
+    unit = unit_factor(table.path, "unit", spec["unit"], ("ft", "m"))
+    known = NEEDED | {f: c for f, c in OPTIONAL.items() if table.has(c[0])}
+    kinds = {field: kind for field, (_, kind) in known.items()}
+    columns = {field: column for field, (column, _) in known.items()}
+    factors = {field: unit for field, kind in kinds.items() if kind == "place"}
+    factors["t"] = 1e-3 if stamped else positive(spec, "frame_s")
+    other = CLOCK  # the clock that is not used: rows that repeat each other agree in it
+    if stamped:
+        columns["t"], other = CLOCK, columns["t"]
+    if table.has(other):
+        kinds["other_clock"], columns["other_clock"] = "time", other
+    if table.has(SITE):
+        kinds["recording"], columns["recording"] = "text", SITE
+    return fields_of(table, kinds, columns=columns, factors=factors, lower=True)
 
 
 def _recordings(table: Table, spec: dict, stats: RowStats) -> Iterator[Recording]:
@@ -102,26 +198,34 @@ def _recordings(table: Table, spec: dict, stats: RowStats) -> Iterator[Recording
         _fields(table, spec, stamped),
         stats,
         is_long=is_long_file(path, spec),
-        may_differ=APART,
-        places=PLACES,
+        may_differ=("leader",),
+        places=("along", "across"),
     ) as rows:
         sites = rows.recordings()
         known, left_out = _known_sites(path, sites, spec)
         for site in known:
-            survey, log = Survey(), log_name(path, spec, own_name(path))
+            survey = _Survey(map(_complete, rows.minutes(site)))
+            log = log_name(path, spec, own_name(path))
             log = log if len(sites) == 1 else f"{log}-{site}"
-            for values in rows.minutes(site):
-                survey.add(_complete(values))
             notes = [*left_out, *survey.notes()]  # once, with the first minute
-            for piece in rows.slices(site, (MAX_FRAME_GAP + 0.5) * frame_s):
-                values = _complete(piece.values)
-                values["frame"] = np.round(values["t"] / frame_s)
-                name = f"{log}{piece.label}"
-                made = site_recording(
-                    path, name, values, spec, survey, stamped=stamped, notes=notes
+            for part in rows.slices(site, (MAX_FRAME_GAP + 0.5) * frame_s):
+                made = Recording(
+                    name=f"{log}{part.label}",
+                    source=spec["source"],
+                    licence=spec["licence"],
+                    rate_hz=1.0 / frame_s,
+                    tracks=_tracks(path, _complete(part.values), spec, survey, stamped),
+                    lanes=survey.lanes(path, spec),
+                    default_speed_limit=number(spec, "speed_limit"),
+                    notes=tuple(notes),
                 )
-                yield piece.of_log(log, made)
+                yield part.of_log(log, made)
                 notes = []
+
+
+def _complete(rows: Rows) -> Rows:
+    """Zeros for optional columns that a file has not."""
+    return dict.fromkeys(OPTIONAL, np.zeros(rows["t"].size)) | rows
 
 
 def _known_sites(
@@ -141,92 +245,110 @@ def _known_sites(
     return [*known], [f"left out, no freeway: {', '.join(left_out)}"][: len(left_out)]
 
 
-def _has_stamps(table: Table) -> bool:
-    """Whether Global_Time [ms] is the clock: positive, and not one for all rows."""
-    column = _column(table, CLOCK)
-    if not table.has(column):
-        return False
-    if any(cell and not cell.strip("0.") for cell in table.samples(column)):
-        return False  # nothing else is read where the first rows say 0
-    fields = Columns(needed={CLOCK: COLUMNS[CLOCK]}, called={CLOCK: column})
-    uncounted = RowStats(path=table.path)
-    read = (part[CLOCK] for part in batches(table, fields.fields(table), uncounted))
-    lowest, highest = np.inf, -np.inf
-    for part in read:
-        if part.size:
-            lowest, highest = min(lowest, part.min()), max(highest, part.max())
-        if lowest <= 0.0:
-            return False
-    return bool(highest > lowest)
+class _Survey:
+    """What the Recordings of a site share, from its rows in any portions.
 
-
-def _open(path: Path, spec: dict) -> tuple[Table, RowStats]:
-    """The portal's table, or the native text, whose columns the TOML names.
-
-    Raises:
-      InputError: a column is missing, or it is an arterial's file.
+    Its memory grows with the different values of Local_X, not with the rows.
     """
-    table, stats = open_log(path, spec)
-    if _is_native(table):
-        columns = _text_columns(spec)
-        if len(table.header) == ARTERIAL_COLUMNS != len(columns):
-            raise InputError(
-                f"{path}: line 1: {len(table.header)} cells: expected {len(columns)}; "
-                "arterials have no straight lanes"
+
+    def __init__(self, portions: Iterable[Rows]) -> None:
+        self.has_lateral = False  # any lateral position
+        self._without: dict[str, set[float]] = {"length": set(), "width": set()}
+        # lane -> different Local_X and how often each is met; ends of Local_Y
+        self._across: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._along: dict[int, tuple[float, float]] = {}
+        for rows in portions:
+            self.has_lateral |= bool(np.any(rows["across"] != 0.0))
+            for field, users in self._without.items():
+                users.update(rows["id"][rows[field] <= 0.0])
+            driven = rows["lane"].astype(int)
+            for lane in np.unique(driven).tolist():
+                x, y = (rows[name][driven == lane] for name in ("across", "along"))
+                values, counts = self._across.get(lane, (x[:0], np.zeros(0, int)))
+                found, more = np.unique(x, return_counts=True)
+                both = np.concatenate([values, found])
+                both, place = np.unique(both, return_inverse=True)
+                total = np.zeros(both.size, np.int64)
+                np.add.at(total, place, np.concatenate([counts, more]))
+                self._across[lane] = both, total
+                lower, upper = self._along.get(lane, (np.inf, -np.inf))
+                ends = min(lower, float(y.min())), max(upper, float(y.max()))
+                self._along[lane] = ends
+
+    def notes(self) -> list[str]:
+        """Returns what was missing."""
+        notes = []
+        if not self.has_lateral:
+            notes.append("no lateral positions; built from lane numbers")
+        for field, users in self._without.items():
+            if users:
+                notes.append(f"{len(users)} vehicles without {field}; default by class")
+        return notes
+
+    def lanes(self, path: Path, spec: dict) -> tuple[Lane, ...]:
+        """Returns a straight lane per lane number, over where it was driven +- 50 m."""
+        width, found = number(spec, "lane_width_m"), []
+        for lane, (lower, upper) in sorted(self._along.items()):
+            y = -width * (lane - 0.5)
+            if self.has_lateral:  # the median of values met several times each
+                values, counts = self._across[lane]
+                last = np.cumsum(counts)
+                middle = np.array([(last[-1] - 1) // 2, last[-1] // 2])
+                middle = values[np.searchsorted(last, middle, side="right")]
+                y = -float(np.mean(middle))
+            lower, upper = lower - MARGIN_M, upper + MARGIN_M
+            found.append(StraightLane(id=str(lane), y=y, lower=lower, upper=upper))
+        lanes = straight_lanes(path, found, width, number(spec, "speed_limit"))
+        return tuple(
+            dataclasses.replace(
+                lane, width_assumed=lane.width_assumed or not self.has_lateral
             )
-        options = {"names": columns, "skip": 0, **section(spec, "table")}
-        table, stats = open_log(path, {**spec, "table": options})
-    if table.has(_column(table, JUNCTION)) and not table.has(_column(table, SITE)):
-        raise InputError(
-            f"{path}: column {SITE}: missing: expected it beside {JUNCTION}; "
-            "arterials have no straight lanes"
+            for lane in lanes
         )
-    return table, stats
 
 
-def _is_native(table: Table) -> bool:
-    """Whether it is the native text, which has no header."""
-    if table.layout is None or any(table.has(_column(table, name)) for name in NEEDED):
-        return False
-    is_numeric = not any(c.isalpha() for c in "".join(table.header))
-    return is_numeric or table.layout.delimiter == BLANKS
+def _tracks(
+    path: Path, rows: Rows, spec: dict, survey: _Survey, stamped: bool
+) -> tuple[Track, ...]:
+    """Tracks of a site's rows, all or of a minute."""
+    frame_s, sizes = positive(spec, "frame_s"), spec.get("sizes", {})
+    frame = np.round(rows["t"] / frame_s)
+    # whether a row names a vehicle ahead that has no row at that time
+    users = np.concatenate([rows["id"], rows["leader"]])
+    users = np.unique(users, return_inverse=True)[1].reshape(2, -1)
+    times = np.unique(frame, return_inverse=True)[1].reshape(-1)
+    own, ahead = users * (times.max() + 1) + times
+    rows = {**rows, "t": frame * frame_s}
+    rows["leader_missing"] = (rows["leader"] > 0.0) & ~np.isin(ahead, own)
+    # with stamps no step back has a meaning
+    reuse = 0.0 if stamped else REUSE_S / frame_s
+    ids = rows["id"].astype(np.int64)
+    tracks = []
+    for name, at in split_tracks(path, ids, frame, MAX_FRAME_GAP, reuse):
+        part = {field: column[at] for field, column in rows.items()}
+        usual = sizes.get(str(int(part["class"][0])), sizes.get("0", SIZE_M))
+        part["x"] = part["along"] - 0.5 * size_of(part, usual)[0]
+        part["y"] = -part["across"]
+        if not survey.has_lateral:
+            part["y"] = _lateral_from_lanes(part["lane"], spec)
+        missing = spans_of(part["t"], part["leader_missing"])
+        tracks.append(track_of(name, part, Kind.VEHICLE, usual, leader_missing=missing))
+    return tuple(tracks)
 
 
-def _column(table: Table, name: str) -> str:
-    """A column's name in the header, without regard to case."""
-    return next((n for n in table.header if n.lower() == name.lower()), name)
+def _lateral_from_lanes(lane: np.ndarray, spec: dict) -> np.ndarray:
+    """Lane centres [n] m, each switch spread over `lane_switch_s`.
 
+        y = y_0 + sum_k (y_k - y_{k-1}) S((t - t_k) / 4 s + 1/2),  S(u) = 3u^2 - 2u^3
 
-def _fields(table: Table, spec: dict, stamped: bool) -> list[Field]:
-    """Columns that are read, in SI units; those that may be missing are, if there."""
-    unit = unit_factor(table.path, "unit", spec["unit"], ("ft", "m"))
-    clock = CLOCK if stamped else "Frame_ID"
-    named = {clock: "t", "Vehicle_ID": "id", SITE: "recording"}
-    actual = {name: _column(table, name) for name in COLUMNS}
-    found = {
-        named.get(name, name): kind
-        for name, kind in COLUMNS.items()
-        if name in NEEDED or table.has(actual[name])
-    }
-    factors = {name: unit for name, kind in found.items() if kind == "place"}
-    factors["t"] = 1e-3 if stamped else positive(spec, "frame_s")
-    called = {named.get(name, name): column for name, column in actual.items()}
-    fields = Columns(needed=found, called=called, factors=factors).fields(table)
-    return [dataclasses.replace(field, lower=field.text) for field in fields]
-
-
-def _complete(rows: Rows) -> Rows:
-    """Zeros for optional columns that a file has not."""
-    none = np.zeros(rows["t"].size)
-    return {name: none for name in OPTIONAL} | rows
-
-
-def _text_columns(spec: dict) -> list[str]:
-    """Column order of the native text."""
-    columns = spec.get("columns", [])
-    if not isinstance(columns, list) or not all(isinstance(n, str) for n in columns):
-        raise InputError(f"source TOML: columns: {columns}: expected a list of names")
-    for name in NEEDED:
-        if name not in columns:
-            raise InputError(f"source TOML: columns: {name}: missing: expected it")
-    return columns
+    with t_k midway between the last sample in the old lane and the first in the
+    new one.
+    """
+    width = number(spec, "lane_width_m")
+    span = number(spec, "lane_switch_s") / positive(spec, "frame_s")
+    y = np.full(lane.shape, -width * (lane[0] - 0.5))
+    samples = np.arange(lane.size)
+    for at in np.flatnonzero(np.diff(lane) != 0.0):
+        u = np.clip((samples - at - 0.5) / max(span, 1e-9) + 0.5, 0.0, 1.0)
+        y -= width * (lane[at + 1] - lane[at]) * u**2 * (3.0 - 2.0 * u)
+    return y

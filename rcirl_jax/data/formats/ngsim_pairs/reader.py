@@ -13,7 +13,6 @@ file; there is no lateral position and no lane; whom the leader follows is not i
 the file (a MissingAgent ahead says so, and its scenes are dropped).
 """
 
-import dataclasses
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -22,8 +21,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from rcirl_jax.data.formats.declared import Columns, Rows, open_log
-from rcirl_jax.data.formats.files import input_files
+from rcirl_jax.data.formats.declared import open_log, read_log
+from rcirl_jax.data.formats.files import files_below
 from rcirl_jax.data.formats.lanes import StraightLane, straight_lanes
 from rcirl_jax.data.formats.options import (
     number,
@@ -33,21 +32,18 @@ from rcirl_jax.data.formats.options import (
     unit_factor,
 )
 from rcirl_jax.data.formats.tracks import split_tracks
-from rcirl_jax.data.readers.tables.rows import LINE, attach_row_stats
+from rcirl_jax.data.readers.tables.rows import LINE, Rows, attach_row_stats
 from rcirl_jax.data.readers.tables.table import open_table
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, MissingAgent, Recording, Track
 
-TABLE = Columns(
-    needed={
-        **{"t": "time", "x_follower": "place", "v_follower": "speed"},
-        **{"x_leader": "place", "v_leader": "speed", "leader_length": "number"},
-    },
-    optional={"spacing": "number"},
-    user=None,
-    places=("x_follower", "x_leader"),
-)
+NEEDED = {
+    **{"t": "time", "x_follower": "place", "v_follower": "speed"},
+    **{"x_leader": "place", "v_leader": "speed", "leader_length": "number"},
+}
+OPTIONAL = {"spacing": "number"}
+PLACES = ("x_follower", "x_leader")
 NAME = re.compile(r"(?P<run>.*?)_?f(?P<follower>\d+)_l(?P<leader>\d+)(_\d+)?")
 MAX_GAP_FRAMES = 5.5  # frames missing inside one track
 MARGIN_M = 50.0  # m of lane beyond the first and last position
@@ -55,14 +51,15 @@ SPACING_FT = 0.5  # tolerance of spacing against the positions
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording of two cars per file."""
-    files = input_files(path, one_pattern(spec, "**/*_f*_l*.csv"))
+    """Yields one Recording of two cars per file."""
+    files = files_below(path, one_pattern(spec, "**/*_f*_l*.csv"))
     groups = _groups(files)
     lengths = _leader_lengths(files, section(spec, "table"))
     for file in files:
         table, stats = open_log(file, spec)
-        columns = dataclasses.replace(TABLE, name_of=lambda _, f=file: _ids(f)[1])
-        rows = columns.read(table, stats)
+        leader = _ids(file)[2]
+        options = {"user": None, "places": PLACES, "name_of": lambda _, n=leader: n}
+        rows = read_log(table, stats, NEEDED, OPTIONAL, **options)
         made = _recording(file, spec, rows, groups[file], lengths)
         yield validate_recording(attach_row_stats(made, stats), file)
 
@@ -106,14 +103,22 @@ def _leader_lengths(
 def _recording(
     path: Path,
     spec: dict,
-    table: Rows,
+    rows: Rows,
     group: str,
     lengths: dict[tuple[str, str], float],
 ) -> Recording:
     factor = unit_factor(path, "unit", spec["unit"], ("ft", "m"))
     run, follower, leader = _ids(path)
-    length = float(np.median(table["leader_length"]))
-    _check_spacing(path, table, length)
+    length = float(np.median(rows["leader_length"]))
+    if "spacing" in rows:  # positions are those of front bumpers
+        gap = rows["x_leader"] - rows["x_follower"] - length
+        wrong = np.flatnonzero(np.abs(gap - rows["spacing"]) > SPACING_FT)
+        if wrong.size:
+            row = int(wrong[0])
+            raise InputError(
+                f"{path}: line {rows[LINE][row]}: spacing: {rows['spacing'][row]:g}: "
+                f"expected {gap[row]:g}, x_leader - x_follower - leader_length"
+            )
     own = lengths.get((run, follower))
     notes = ["no lateral positions; both cars on one straight lane"]
     if own is None:
@@ -121,8 +126,9 @@ def _recording(
         notes.append(f"length of follower {follower} unknown; default")
     rate = positive(spec, "rate_hz")
     # t is rounded to the clock: it is written with the noise of floating point
-    frames = np.round((table["t"] - table["t"].min()) * rate)
+    frames = np.round((rows["t"] - rows["t"].min()) * rate)
     pieces = split_tracks(path, np.zeros(frames.size, int), frames, MAX_GAP_FRAMES)
+    cars = ("follower", follower, own), ("leader", leader, length)
     tracks = tuple(
         Track(
             id=name + part.removeprefix("0"),
@@ -130,17 +136,14 @@ def _recording(
             length=size * factor,
             width=number(spec, "width_m"),
             size_assumed=True,  # no file says a width
-            t=frames[rows] / rate,
-            x=(table[f"x_{role}"][rows] - 0.5 * size) * factor,
-            y=np.zeros(rows.shape),
-            heading=np.zeros(rows.shape),
-            speed=table[f"v_{role}"][rows] * factor,
+            t=frames[at] / rate,
+            x=(rows[f"x_{role}"][at] - 0.5 * size) * factor,
+            y=np.zeros(at.shape),
+            heading=np.zeros(at.shape),
+            speed=rows[f"v_{role}"][at] * factor,
         )
-        for role, name, size in (
-            ("follower", follower, own),
-            ("leader", leader, length),
-        )
-        for part, rows in pieces
+        for role, name, size in cars
+        for part, at in pieces
     )
     limit = number(spec, "speed_limit")
     lane = StraightLane(
@@ -149,7 +152,6 @@ def _recording(
         lower=min(float(track.x.min()) for track in tracks) - MARGIN_M,
         upper=max(float(track.x.max()) for track in tracks) + MARGIN_M,
     )
-    width = number(spec, "lane_width_m")
     last, end = max(float(track.t[-1]) for track in tracks), (lane.upper, 0.0)
     return Recording(
         name=path.stem,
@@ -157,24 +159,10 @@ def _recording(
         licence=spec["licence"],
         rate_hz=rate,
         tracks=tracks,
-        lanes=straight_lanes(path, [lane], width, limit),
+        lanes=straight_lanes(path, [lane], number(spec, "lane_width_m"), limit),
         group=group,
         # somebody ahead of both cars all the time
         missing_agents=(MissingAgent(t0=0.0, t1=last, start=end, end=end),),
         default_speed_limit=limit,
         notes=tuple(notes),
     )
-
-
-def _check_spacing(path: Path, table: Rows, length: float) -> None:
-    """The file's own spacing says that positions are those of front bumpers."""
-    if "spacing" not in table:
-        return
-    gap = table["x_leader"] - table["x_follower"] - length
-    wrong = np.abs(gap - table["spacing"]) > SPACING_FT
-    if wrong.any():
-        row = int(np.flatnonzero(wrong)[0])
-        raise InputError(
-            f"{path}: line {table[LINE][row]}: spacing: {table['spacing'][row]:g}: "
-            f"expected {gap[row]:g}, x_leader - x_follower - leader_length"
-        )

@@ -3,7 +3,7 @@
 from rcirl_jax.data.formats.format import Format
 
 FORMAT = Format(
-    told_by="drive",
+    told_by="reader",
     is_small=True,
     is_declared=True,
     free=("sizes",),

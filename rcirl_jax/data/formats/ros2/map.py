@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.formats.csv.map import LogTable, lane_file_of, lanes_of
 from rcirl_jax.data.formats.lanelet2.map import read_lanelet2
+from rcirl_jax.data.formats.lanes import lane_file_of, lanes_of_toml
 from rcirl_jax.data.formats.options import path_option, section
 from rcirl_jax.data.formats.perception import held_states, signal_of
 from rcirl_jax.data.formats.projection import utm, utm_zone
@@ -47,8 +47,7 @@ def given_lanes(path: Path, spec: dict) -> tuple[Sequence[Lane], list[str]] | No
         return read_lanelet2(Path(place), _on_square)
     if not spec.get("lanes"):
         return None
-    table = LogTable(path=path, values={}, rate_hz=0.0, origin=np.zeros(2), notes=())
-    return lanes_of(table, spec, ())
+    return lanes_of_toml(path, spec), []
 
 
 def _on_square(latitude: np.ndarray, longitude: np.ndarray) -> np.ndarray:

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from rcirl_jax.data.formats.files import files_matching
+from rcirl_jax.data.formats.files import files_below
 from rcirl_jax.data.formats.options import (
     kind_of,
     number,
@@ -103,7 +103,7 @@ class _States:
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """Lists the TFRecord files; each can be read alone."""
-    return files_matching(path, patterns(spec, PATTERNS), "TFRecord files")
+    return files_below(path, patterns(spec, PATTERNS), "TFRecord files")
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:

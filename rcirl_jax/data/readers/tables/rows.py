@@ -100,7 +100,7 @@ def attach_row_stats(made: Recording, *files: RowStats) -> Recording:
 
 
 def allowed_share(spec: Mapping) -> float:
-    """The option `max_bad_rows` of a source TOML."""
+    """Returns the option `max_bad_rows` of a source TOML."""
     value = spec.get("max_bad_rows", MAX_BAD_ROWS)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"source TOML: max_bad_rows: {value}: expected a number")

@@ -14,7 +14,7 @@ from typing import IO, Any
 
 from rcirl_jax.errors import InputError, extra_module
 
-READ_CHARS = 4 * 2**20  # characters that are read at a time
+READ_CHARS = 8 * 2**20  # characters that are read at a time
 MAX_LINE = 2**24  # characters of a line; pNEUMA writes a drive of minutes into one
 MAX_SPAN = 20  # lines of one row, by line ends inside of quotes
 HEAD_LINES = 60  # lines from which a layout is recognised
@@ -119,9 +119,12 @@ def _text(path: Path, encoding: str) -> Iterator[tuple[io.TextIOWrapper, IO[byte
             made.detach()
 
 
-def _line(path: Path, text: io.TextIOWrapper) -> str:
+def _line(path: Path, text: io.TextIOWrapper, ends_early: bool = False) -> str:
+    """The next line, "" at the end; or, if asked for, instead of one too long."""
     line = text.readline(MAX_LINE + 1)
     if len(line) > MAX_LINE:
+        if ends_early:
+            return ""
         raise InputError(
             f"{path}: a line of more than {MAX_LINE} characters: expected one a row"
         )
@@ -144,7 +147,7 @@ def head_of(path: Path, encoding: str = "") -> tuple[str, list[str]]:
     lines: list[str] = []
     with _text(path, encoding) as (text, _):
         while len(lines) < HEAD_LINES and sum(map(len, lines)) <= MAX_LINE:
-            if not (line := _line(path, text)):
+            if not (line := _line(path, text, ends_early=bool(lines))):
                 break
             lines.append(line)
     some = "".join(lines)[:HEAD_BYTES]

@@ -245,7 +245,7 @@ class _Column:
         return self.wrong | (self.empty & self.field.needed)
 
     def complaint(self, row: int) -> str:
-        """What is wrong with the cell of a row."""
+        """Says what is wrong with the cell of a row."""
         field, value = self.field, self.values[row]
         cell = self.cells[row].as_py()
         text = "" if cell is None else str(cell)

@@ -29,6 +29,7 @@ from rcirl_jax.errors import InputError, extra_module
 from rcirl_jax.runtime.checked import check_names
 
 MAX_COLUMNS = 10_000  # of a table; logs have some dozens
+PACKED_ROWS = 2**13  # that are held as lists of cells
 MOST = 0.8  # share of a head's rows that repeat their last columns
 SAMPLE_CELLS = 20_000  # cells of the head from which decimals are recognised
 DELIMITERS = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";", "pipe": "|"}
@@ -68,7 +69,7 @@ class Layout:
     repeating: int = 0
 
     def in_words(self) -> str:
-        """The layout in one line."""
+        """Returns the layout in one line."""
         names = {mark: name for name, mark in DELIMITERS.items()}
         between = names.get(self.delimiter, repr(self.delimiter))
         said = [f"text in {self.encoding}", f"{between} between cells"]
@@ -83,7 +84,7 @@ class Layout:
 
 @functools.cache
 def grouped(mark: str, decimal: str) -> str:
-    """Pattern of a number with a mark between its thousands."""
+    """Returns the pattern of a number with a mark between its thousands."""
     return (
         rf"[-+]?[1-9]\d{{0,2}}(?:{re.escape(mark)}\d{{3}})+(?:{re.escape(decimal)}\d*)?"
     )
@@ -306,7 +307,7 @@ def _trimmed(row: Sequence[str]) -> list[str]:
 
 
 def decimal_of(rows: Sequence[Sequence[str]], delimiter: str) -> tuple[str, str]:
-    """(decimal mark, mark between thousands) of the numbers in rows."""
+    """Returns (decimal mark, mark between thousands) of the numbers in rows."""
     cells = itertools.chain.from_iterable(rows)
     every = [cell.strip() for cell in itertools.islice(cells, SAMPLE_CELLS)]
     points = any("." in cell and NUMBER.fullmatch(cell) for cell in every)
@@ -355,7 +356,9 @@ def text_batches(
     """
     for start, whole in blocks(path, layout.encoding, layout.quote, show):
         above = max(layout.skip - start + 1, 0)  # lines above the first row
-        text = whole.split("\n", above)[-1] if whole.count("\n") >= above else ""
+        text = whole
+        if above:
+            text = whole.split("\n", above)[-1] if whole.count("\n") >= above else ""
         if not text:
             continue
         if layout.delimiter == BLANKS:  # runs as one, none at the ends of lines
@@ -405,7 +408,10 @@ def _columns_of(text: str, layout: Layout, places: Sequence[int]) -> list[Any] |
         )
     except arrow.ArrowInvalid:
         return None
-    return [table.column(name).combine_chunks() for name in wanted]
+    return [
+        column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
+        for column in map(table.column, wanted)
+    ]
 
 
 def _row_by_row(
@@ -413,7 +419,15 @@ def _row_by_row(
 ) -> TextBatch:
     """Returns columns of rows of which some are none, repeat, or take several lines."""
     width, fixed = len(layout.header), len(layout.header) - layout.repeating
+    arrow = extra_module("pyarrow")
+    parts: list[list[Any]] = [[] for _ in places]  # arrays take less room than lists
     rows: list[list[str]] = []
+
+    def pack() -> None:
+        for k, arrays in enumerate(parts):
+            arrays.append(arrow.array([row[k] for row in rows], arrow.string()))
+        rows.clear()
+
     numbers: list[int] = []
     unreadable: list[tuple[int, str]] = []
     every, at = text.removesuffix("\n").split("\n"), 0
@@ -440,16 +454,17 @@ def _row_by_row(
                 row.pop()
             if len(row) == width:
                 rows.append([row[place] for place in places])
+                if len(rows) >= PACKED_ROWS:
+                    pack()
                 numbers.append(number)
             else:
                 unreadable.append((number, f"{len(row)} cells: expected {width}"))
-    arrow = extra_module("pyarrow")
-    columns = [
-        arrow.array([row[k] for row in rows], arrow.string())
-        for k in range(len(places))
-    ]
-    lines = np.array(numbers, np.int64)
-    return TextBatch(columns=columns, lines=lines, unreadable=unreadable)
+    pack()
+    return TextBatch(
+        columns=[arrow.concat_arrays(arrays) for arrays in parts],
+        lines=np.array(numbers, np.int64),
+        unreadable=unreadable,
+    )
 
 
 def _span(lines: Sequence[str], layout: Layout) -> int:

@@ -1,26 +1,23 @@
 """What the columns of a user's table mean: the source TOML, and what it leaves open.
 
 The TOML says which column is which field, in which unit, with which scale and offset.
-What it does not say is recognised by the columns' names and first cells: ISO times,
-latitude and longitude. A column name with {id} stands for one column per road user, of
-tables with one row per frame.
+What it does not say is recognised by the columns' names and first cells: ISO times and
+dates, latitude and longitude. A column name with {id} stands for one column per road
+user, of tables with one row per frame.
 """
 
+import contextlib
 import dataclasses
+import datetime
+import itertools
 import math
 import re
-from collections.abc import Mapping as AnyMapping
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rcirl_jax.data.formats.csv.dates import date_pattern
-from rcirl_jax.data.formats.options import (
-    UNITS,
-    number,
-    positive,
-    section,
-)
+from rcirl_jax.data.formats.options import UNITS, number, positive, section
+from rcirl_jax.data.formats.projection import projected
 from rcirl_jax.data.readers.tables.cells import EMPTY, ISO
 from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
@@ -62,18 +59,24 @@ LIMITS = {
 DEGREES = {"x": 360.0, "y": 90.0}  # longitude counts from -180 or from 0
 RATE_HZ = 10.0  # 1/s
 ISO_TIMES = r"\d{4}-\d\d-\d\d[T ]|\d{8}T\d|\d{4}/\d\d/\d\d |\d{1,2}:\d\d"  # as read
+# dates that are neither numbers nor ISO's; the day comes first where both orders fit
+DATES = ("%d.%m.%Y", "%d.%m.%y", "%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y")
+TIMES_OF_DAY = (
+    *("%H:%M:%S.%f", "%H:%M:%S,%f", "%H:%M:%S", "%I:%M:%S.%f %p", "%I:%M:%S %p"),
+)
 WORD = r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+"  # of a name in camel case too
 DEGREE_M = 111_320.0  # m of a degree of latitude
 MIDDLE_DIGITS = 2  # of latitude and longitude of the projection's middle
 HOLE = "{id}"  # in a column's name: which road user's it is
-WORDS = {
+EARTH_WORDS = {
     "x": {"lon", "lng", "long", "longitude", "längengrad", "laengengrad"},
     "y": {"lat", "latitude", "breitengrad"},
 }
+Found = list[tuple[str, str, str | None]]  # field, column with its sign, user
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Mapping:
+class LogColumns:
     """The fields of one table, and how its positions and headings are meant."""
 
     fields: tuple[Field, ...]
@@ -87,7 +90,7 @@ class Mapping:
     notes: tuple[str, ...] = ()
 
     def distance(self, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
-        """Metres [n] of differences in x and y as rows have them, roughly on earth."""
+        """Returns metres [n] of differences in x and y of the file, rough on earth."""
         if self.middle is None:
             return np.hypot(dx, dy)
         turn, north = 360.0 / self.degrees, self.degrees * DEGREE_M
@@ -95,18 +98,25 @@ class Mapping:
         dx = (dx + 0.5 * turn) % turn - 0.5 * turn  # over the 180th meridian
         return np.hypot(east * dx, north * dy)
 
+    def metres(self, points: np.ndarray) -> np.ndarray:
+        """Returns positions [n, 2] of the file in metres."""
+        if self.middle is None:
+            return points
+        degrees = points * self.degrees
+        east, north = projected(degrees[:, 0], degrees[:, 1], self.middle)
+        return np.stack([east, north], axis=1)
 
-def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
-    """The mapping of a table by its source TOML.
+
+def columns_of(table: Table, spec: Mapping) -> LogColumns:
+    """Returns the columns of a table by its source TOML.
 
     Raises:
       InputError: an unknown field or unit, a needed column that is missing.
     """
     rate = positive({**spec, **section(spec, "defaults")}, "rate_hz", RATE_HZ)
-    columns, units, notes = _columns(table, spec)
+    columns, units, notes = _named(table, spec)
     _check_units(table, spec, units)
-    found, missing = _found(table, columns)
-    notes += missing
+    found = _found(table, columns, notes)
     middle, degrees = None, 1.0
     if units.get("x") in ANGLES:
         degrees = 1.0 if units["x"] == "deg" else math.degrees(1.0)
@@ -114,30 +124,25 @@ def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
         notes.append(
             f"latitude, longitude projected about {middle[0]:g}, {middle[1]:g} degrees"
         )
-    clock = next(name for field, name, _ in found if field == "t")
+    clock = next(name.lstrip("-") for field, name, _ in found if field == "t")
     form, factor = _time(table, clock, units.get("t"), rate, notes)
-    limit = math.inf if form else LIMITS["t"] / min(factor, 1.0)
-    fields = [_field(field, name, user, units, spec) for field, name, user in found]
-    fields = [
-        dataclasses.replace(f, form=form, limit=limit, factor=f.factor * factor)
-        if f.name == "t"
-        else f
-        for f in fields
-    ]
-    return Mapping(
-        fields=tuple(fields),
+    is_clock = bool(re.search("%[HI]", form)) and not re.search("%[djcxU]", form)
+    if form == ISO:
+        is_clock = re.match(r"\d{1,2}:\d", first_cell(table, clock)) is not None
+    return LogColumns(
+        fields=tuple(_field(*one, units, spec, form, factor) for one in found),
         rate_hz=rate,
         middle=middle,
         degrees=degrees,
         heading_unit=units.get("heading", ""),
         has_units="x" in section(spec, "units") or middle is not None,
-        is_clock=_is_clock(form, first_cell(table, clock.lstrip("-"))),
+        is_clock=is_clock,
         notes=tuple(notes),
     )
 
 
-def _columns(
-    table: Table, spec: AnyMapping
+def _named(
+    table: Table, spec: Mapping
 ) -> tuple[dict[str, str], dict[str, str], list[str]]:
     """(field -> column, field -> unit, notes), latitude and longitude as y and x."""
     columns, units = dict(section(spec, "columns")), dict(section(spec, "units"))
@@ -164,15 +169,6 @@ def _columns(
             f"{where}id: {columns['id']}: expected none beside "
             f"columns.x = {columns['x']!r}, whose {HOLE} is the id"
         )
-    _check_texts(where, columns)
-    notes: list[str] = []
-    if "x" not in units and "y" not in units and not is_wide:
-        columns, units = _recognised_earth(table, columns, units, notes)
-    return columns, units, notes
-
-
-def _check_texts(where: str, columns: AnyMapping[str, str]) -> None:
-    """No column of numbers is one that is read as text."""
     texts = {columns[field] for field in TEXT if field in columns}
     for field, column in columns.items():
         if field not in TEXT and column in texts:
@@ -180,47 +176,57 @@ def _check_texts(where: str, columns: AnyMapping[str, str]) -> None:
                 f"{where}{field}: {column}: expected a column of "
                 "numbers, not one that is read as text"
             )
+    if "x" in units or "y" in units or is_wide:
+        return columns, units, []
+    for x, y in (("x", "y"), ("y", "x")):  # degrees, by their names and cells
+        cells = {"x": columns[x], "y": columns[y]}
+        if not all(EARTH_WORDS[a] & words_of(cells[a]) for a in "xy"):
+            continue
+        if not all(table.has(name) for name in cells.values()):
+            continue
+        values = {axis: sampled(table, cells[axis]) for axis in "xy"}
+        if all(v.size and np.abs(v).max() <= DEGREES[a] for a, v in values.items()):
+            note = f"columns {columns[x]}, {columns[y]}: longitude and latitude"
+            return {**columns, **cells}, {**units, "x": "deg", "y": "deg"}, [note]
+    return columns, units, []
 
 
 def words_of(name: str) -> set[str]:
-    """Words of a column's name, in small letters: gpsLon and GPS_Lon hold lon."""
+    """Returns words of a column's name: gpsLon and GPS_Lon hold lon."""
     return {word.lower() for word in re.findall(WORD, name)}
 
 
-def _recognised_earth(
-    table: Table, columns: dict[str, str], units: dict[str, str], notes: list[str]
-) -> tuple[dict[str, str], dict[str, str]]:
-    """The columns, with x and y in degrees where their names and cells say so."""
-    for x, y in (("x", "y"), ("y", "x")):
-        named = WORDS["x"] & words_of(columns[x]) and WORDS["y"] & words_of(columns[y])
-        if not named or not (table.has(columns["x"]) and table.has(columns["y"])):
-            continue
-        cells = {"x": columns[x], "y": columns[y]}
-        if all(_within(table, cells[axis], DEGREES[axis]) for axis in "xy"):
-            notes.append(f"columns {columns[x]}, {columns[y]}: longitude and latitude")
-            return {**columns, **cells}, {**units, "x": "deg", "y": "deg"}
-    return columns, units
-
-
 def known_cells(table: Table, column: str) -> list[str]:
-    """The first cells of a column that are not empty."""
+    """Returns the first cells of a column that are not empty."""
     return [cell for cell in table.samples(column) if cell.lower() not in EMPTY]
 
 
 def first_cell(table: Table, column: str) -> str:
-    """The first cell of a column that is not empty, "" without one."""
+    """Returns the first cell of a column that is not empty, "" without one."""
     return next(iter(known_cells(table, column)), "")
 
 
 def sampled(table: Table, column: str) -> np.ndarray:
-    """The numbers among the first cells of a column."""
+    """Returns the numbers among the first cells of a column."""
     cells = table.samples(column)
     if table.marks(column)[0] == ",":
         cells = [cell.replace(",", ".") for cell in cells]
     return np.array([float(cell) for cell in cells if NUMBER.fullmatch(cell)])
 
 
-def _scaled(field: str, spec: AnyMapping) -> tuple[float, float]:
+def date_pattern(cells: Sequence[str]) -> str:
+    """Returns the pattern of strptime that all cells have; "" if none is known."""
+    for date, rest in itertools.product(DATES, TIMES_OF_DAY):
+        pattern = f"{date} {rest}"
+        with contextlib.suppress(ValueError):
+            for cell in cells:
+                datetime.datetime.strptime(cell, pattern)
+            if cells:
+                return pattern
+    return ""
+
+
+def _scaled(field: str, spec: Mapping) -> tuple[float, float]:
     """Scale and offset of a field, also under its name as latitude or longitude."""
     alias = next((name for name, own in EARTH.items() if own == field), field)
     scale, offset = section(spec, "scale"), section(spec, "offset")
@@ -230,16 +236,8 @@ def _scaled(field: str, spec: AnyMapping) -> tuple[float, float]:
     )
 
 
-def _within(table: Table, column: str, limit: float) -> bool:
-    found = sampled(table, column)
-    return bool(found.size) and bool(np.all(np.abs(found) <= limit))
-
-
 def _middle(
-    table: Table,
-    found: Sequence[tuple[str, str, str | None]],
-    degrees: float,
-    spec: AnyMapping,
+    table: Table, found: Found, degrees: float, spec: Mapping
 ) -> tuple[float, float]:
     """Latitude and longitude [deg] near the first rows, rounded."""
     places = []
@@ -257,7 +255,7 @@ def _middle(
     return places[0], (places[1] + 180.0) % 360.0 - 180.0
 
 
-def _check_units(table: Table, spec: AnyMapping, units: dict[str, str]) -> None:
+def _check_units(table: Table, spec: Mapping, units: dict[str, str]) -> None:
     """Units are known; scales and offsets are numbers of fields that have a unit."""
     fields = (*ALLOWED_UNITS, *EARTH)
     scaled = {name: section(spec, name) for name in ("scale", "offset")}
@@ -278,15 +276,21 @@ def _check_units(table: Table, spec: AnyMapping, units: dict[str, str]) -> None:
         )
 
 
-def _found(
-    table: Table, columns: AnyMapping[str, str]
-) -> tuple[list[tuple[str, str, str | None]], list[str]]:
-    """(field, column with its sign, user) of all columns, and notes on missing ones."""
-    found: list[tuple[str, str, str | None]] = []
-    missing: list[str] = []
-    users = _users(table, columns) if HOLE in columns.get("x", "") else []
-    if not users:
-        _check_is_log(table, [columns[field] for field in NEEDED])
+def _found(table: Table, columns: Mapping[str, str], notes: list[str]) -> Found:
+    """All columns that are there; notes on those that are not."""
+    found: Found = []
+    is_wide = HOLE in columns.get("x", "")
+    users = _users(table, columns) if is_wide else []
+    if not is_wide:
+        needed = [columns[field] for field in NEEDED]
+        is_log = any(table.has(name.lstrip("-")) for name in needed)
+        # without a header that names any, the missing column is named below
+        if not is_log and not any(NUMBER.fullmatch(name) for name in table.header):
+            raise InputError(
+                f"{table.path}: header: {[*table.header[:20]]}: none of the columns "
+                f"{', '.join(needed)}: expected a log; `pattern` of the TOML leaves "
+                "out tables that are none"
+            )
     for field, name in columns.items():
         plain = name.removeprefix("-") if field not in TEXT else name
         sign = name[: len(name) - len(plain)]
@@ -297,27 +301,11 @@ def _found(
             elif field in EXPECTED:
                 table.place(column)  # says that it is missing
             elif user is None:
-                missing.append(f"no column '{column}': {field} computed or by default")
-    return found, missing
+                notes.append(f"no column '{column}': {field} computed or by default")
+    return found
 
 
-def _check_is_log(table: Table, needed: Sequence[str]) -> None:
-    """A table has some of the columns needed, or no header that names any.
-
-    Raises:
-      InputError: it is another table, as a list of files beside the logs is.
-    """
-    if any(table.has(name.lstrip("-")) for name in needed):
-        return
-    if not any(NUMBER.fullmatch(name) for name in table.header):
-        raise InputError(
-            f"{table.path}: header: {[*table.header[:20]]}: none of the columns "
-            f"{', '.join(needed)}: expected a log; `pattern` of the TOML leaves out "
-            "tables that are none"
-        )
-
-
-def _users(table: Table, columns: AnyMapping[str, str]) -> list[str]:
+def _users(table: Table, columns: Mapping[str, str]) -> list[str]:
     """Road users that have both an x and a y in a row per frame."""
     own = []
     for field in ("x", "y"):
@@ -328,28 +316,26 @@ def _users(table: Table, columns: AnyMapping[str, str]) -> list[str]:
         own.append([match[1] for match in matches if match])
     both = set(own[1])
     users = [user for user in own[0] if user in both]
-    numbered = [user for user in users if user.isdigit()]
     if not users:
         raise InputError(
             f"{table.path}: columns.x: {columns['x']}: expected columns of this name "
             f"and of {columns['y']} in the header, such as for {HOLE} = 1"
         )
-    return numbered or users
+    return [user for user in users if user.isdigit()] or users
 
 
 def _time(
     table: Table, name: str, unit: str | None, rate: float, notes: list[str]
 ) -> tuple[str, float]:
     """(form, factor) of the clock; where nothing is said, as its first cells are."""
-    first = first_cell(table, name.lstrip("-"))
+    cells = known_cells(table, name)
+    first = next(iter(cells), "")
     is_iso = re.match(ISO_TIMES, first) is not None
-    if unit is None and is_iso:
-        notes.append(f"column {name}: ISO times")
-        return ISO, 1.0
-    pattern = date_pattern(known_cells(table, name.lstrip("-")))
-    if unit is None and pattern:
-        notes.append(f"column {name}: times as {pattern}")
-        return pattern, 1.0
+    pattern = "" if is_iso else date_pattern(cells)
+    if unit is None and (is_iso or pattern):
+        said = "ISO times" if is_iso else f"times as {pattern}"
+        notes.append(f"column {name}: {said}")
+        return pattern or ISO, 1.0
     if unit == ISO or (unit is not None and "%" in unit):
         return unit, 1.0
     if is_iso or pattern:
@@ -360,34 +346,32 @@ def _time(
     return "", 1.0 / rate if unit == "frame" else UNITS[unit or "s"]
 
 
-def _is_clock(form: str, first: str) -> bool:
-    """Whether times are those of a day that nobody names."""
-    if form == ISO:
-        return re.match(r"\d{1,2}:\d", first) is not None
-    return bool(re.search("%[HI]", form)) and not re.search("%[djcxU]", form)
-
-
 def _field(
     field: str,
     name: str,
     user: str | None,
-    units: AnyMapping[str, str],
-    spec: AnyMapping,
+    units: Mapping[str, str],
+    spec: Mapping,
+    form: str,
+    clock: float,
 ) -> Field:
     """One column as the reader takes it; "-name" turns an axis round."""
     plain = name.removeprefix("-") if field not in TEXT else name
     scale, offset = _scaled(field, spec)
     unit, limit, factor = units.get(field, ""), LIMITS.get(field, np.inf), 1.0
     is_place_on_earth = unit in ANGLES and field in DEGREES
-    if is_place_on_earth:
+    if field == "t":
+        limit, factor = math.inf if form else LIMITS["t"] / min(clock, 1.0), clock
+    elif is_place_on_earth:
         limit = DEGREES[field] * (UNITS["deg"] if unit == "rad" else 1.0)
-    elif unit in UNITS and field not in ("heading", "t"):
+    elif unit in UNITS and field != "heading":
         factor = UNITS[unit]
     return Field(
         name=field,
         column=plain,
         needed=field in (*NEEDED, "recording"),
         text=field in TEXT,
+        form=form if field == "t" else "",
         scale=scale,
         offset=offset,
         factor=-factor if plain != name else factor,
