@@ -6,7 +6,7 @@ import pytest
 
 from rcirl_jax.data import importing
 from rcirl_jax.data.formats import read_recordings
-from rcirl_jax.data.formats.options import STATED
+from rcirl_jax.data.formats.options import USER_KEYS
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml, spec_root
@@ -22,7 +22,7 @@ def read(form, path, source=None, **options):
     if not options:
         return list(read_recordings(form, path, source))
     reader = importlib.import_module(f"rcirl_jax.data.formats.{form}.reader")
-    spec = {**packaged(form), **options, STATED: sorted(options)}
+    spec = {**packaged(form), **options, USER_KEYS: sorted(options)}
     return list(reader.recordings(path, spec))
 
 

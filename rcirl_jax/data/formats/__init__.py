@@ -16,7 +16,7 @@ from pathlib import Path
 from rcirl_jax.data.formats.declared import with_numbers_and_texts
 from rcirl_jax.data.formats.files import log_name, with_log_names
 from rcirl_jax.data.formats.format import Format
-from rcirl_jax.data.formats.options import STATED, check_options
+from rcirl_jax.data.formats.options import USER_KEYS, check_options
 from rcirl_jax.data.readers.tables.rows import NoRowsError
 from rcirl_jax.data.readers.tables.streams import refuse_pointer
 from rcirl_jax.data.recording import empty_recording
@@ -101,7 +101,7 @@ def parts(
             check_options(spec, load_toml(packaged), format_of(name))
         if format_of(name).is_declared:
             spec = with_numbers_and_texts(spec, load_toml(packaged))
-    spec = {**spec, STATED: own}
+    spec = {**spec, USER_KEYS: own}
     if input_path is None:
         if name != "synthetic":
             raise InputError("input: not given: expected a file or folder")

@@ -13,7 +13,7 @@ from rcirl_jax.units import FOOT_M, MPH_MPS
 
 LARGEST = 10**18  # of an integer
 # added to a spec: names of the options that the user's own TOML has
-STATED = "stated"
+USER_KEYS = "stated"
 MAX_NAME = 255  # bytes of a file's name
 MAX_PATH = 2048  # bytes of a path; systems take 4096, with the folder before it
 MAX_PARTS = 32  # of a pattern, which pathlib matches by recursion
@@ -60,7 +60,7 @@ def stated(spec: Mapping, key: str) -> float | None:
 
     What a user's TOML says of a site counts as known, a packaged TOML's as a guess.
     """
-    return positive(spec, key) if key in spec.get(STATED, ()) else None
+    return positive(spec, key) if key in spec.get(USER_KEYS, ()) else None
 
 
 def unit_factor(path: Path, field: str, unit: str, allowed: Sequence[str]) -> float:

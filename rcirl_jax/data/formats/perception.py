@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.formats.lanes import path_lanes
-from rcirl_jax.data.formats.options import STATED, number, positive, section, stated
+from rcirl_jax.data.formats.options import USER_KEYS, number, positive, section, stated
 from rcirl_jax.data.formats.shapes import local_origin
 from rcirl_jax.data.formats.tracks import once_each, split_tracks
 from rcirl_jax.data.recording import LENGTH_RANGE_M, MAX_SPEED_MPS, WIDTH_RANGE_M
@@ -83,7 +83,7 @@ def ego_boxes(
     )
     x, y = x + ahead * np.cos(heading), y + ahead * np.sin(heading)
     ids, kinds = np.zeros(t.size, np.int64), np.full(t.size, int(Kind.VEHICLE))
-    is_assumed = "ego" not in spec.get(STATED, ())
+    is_assumed = "ego" not in spec.get(USER_KEYS, ())
     return Boxes(
         ids, ("ego",), t, x, y, heading, speed, length, width, kinds, is_assumed
     )

@@ -15,7 +15,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from rcirl_jax.data.formats.options import STATED
+from rcirl_jax.data.formats.options import USER_KEYS
 from rcirl_jax.data.formats.synthetic.roads import ROADS, lanes, to_world
 from rcirl_jax.data.formats.synthetic.traffic import (
     DriverConfig,
@@ -86,7 +86,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """
     own = load_toml(path)
     # what an import adds says nothing here: none of these is refused
-    packaged = {k: v for k, v in spec.items() if k not in (LEAVE_OUT, STATED)}
+    packaged = {k: v for k, v in spec.items() if k not in (LEAVE_OUT, USER_KEYS)}
     settings = {**packaged, **own}
     settings["drivers"] = {**_table(spec, "drivers"), **_table(own, "drivers")}
     checked(settings, _File, path)
