@@ -7,8 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from rcirl_jax.data.formats.csv.names import fields_by_name
-from rcirl_jax.data.formats.csv.suggest import suggested
+from rcirl_jax.data.formats.csv.suggest import fields_by_name, suggested
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml
 from tests.data.formats import people
