@@ -263,9 +263,13 @@ class _Fitted:
             if len(points) - last < MIN_POINTS:
                 last = len(points)
             # [n, m] whether point n is near lane point m, and heads the same way
-            gap = points[first:last, None] - self.points[None]
-            known = ways[first:last] @ self.ways.T > MIN_ALIGNED
-            known &= np.hypot(gap[..., 0], gap[..., 1]) < self.width
+            piece = points[first:last]
+            low, high = piece.min(axis=0) - self.width, piece.max(axis=0) + self.width
+            near = np.all((self.points >= low) & (self.points <= high), axis=1)
+            gap = piece[:, None] - self.points[None, near]
+            known = np.zeros((len(piece), len(near)), bool)
+            known[:, near] = ways[first:last] @ self.ways[near].T > MIN_ALIGNED
+            known[:, near] &= np.hypot(gap[..., 0], gap[..., 1]) < self.width
             if known.any(axis=1).mean() > 0.5:
                 first, before = last - 1, -1
                 continue
