@@ -44,17 +44,16 @@ from benchmarks.common import dataset_or_synthetic, machine, timed, untrained, w
 from rcirl_jax.data.store.dataset import Dataset, open_dataset
 from rcirl_jax.evaluation.ranking.learners import normaliser_of
 from rcirl_jax.planner.rank import RankConfig
-from rcirl_jax.reward import value
+from rcirl_jax.reward import RewardModel, value
 from rcirl_jax.simulation.metrics import CaseMetrics, MetricsConfig, case_metrics
 from rcirl_jax.simulation.rollout import drive_cases
 from rcirl_jax.simulation.rows import baseline_row
 from rcirl_jax.simulation.suite import build, rollout_config, suite_refs
-from rcirl_jax.train.featurise import featurised
-from rcirl_jax.train.frozen import fit, freeze, members_of
-from rcirl_jax.train.loop import host_batch
+from rcirl_jax.train.featurise import featurised, host_batch
 from rcirl_jax.train.parallel import Parallel, parallelise
 from rcirl_jax.train.state import TrainConfig, TrainState
 from rcirl_jax.train.step import gradient_sums, init_state, make_train_step
+from rcirl_jax.train.sweep import fit, freeze, members_of
 from rcirl_jax.tuning.recipes import load_recipe
 
 _DATA = flags.DEFINE_string("data", None, "dataset (default: synthetic traffic)")
@@ -128,9 +127,11 @@ def _on(device: Any, dataset: Dataset, count: int) -> dict[str, np.ndarray]:  # 
         frozen = freeze(rows, index, config)
         state = init_state(config, normaliser_of(frozen, config))
         batch = jax.device_put(frozen, device)
-        sums = jax.jit(lambda s, b: gradient_sums(s.params, s.normaliser, b, config))
+        sums = jax.jit(
+            lambda s, b: gradient_sums(s.apply_fn, s.params, s.normaliser, b, config)
+        )
         of = (state.params, state.normaliser, batch.points, batch.points_valid)
-        values = np.asarray(value(*of, config.reward))
+        values = np.asarray(value(RewardModel(config.reward), *of))
         gradient, _ = sums(state, batch)
         flat = np.concatenate([np.ravel(x) for x in jax.tree.leaves(gradient)])
     kept = np.where(np.asarray(frozen.feasible), values, -np.inf)

@@ -21,7 +21,7 @@ from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.features import feature_map
-from rcirl_jax.reward import RewardConfig, init_reward, pinned
+from rcirl_jax.reward import RewardConfig, effective_params, init_params
 from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.runtime.provenance import processor
 from rcirl_jax.types import Normaliser, RewardParams
@@ -134,7 +134,7 @@ def dataset_or_synthetic(path: str | None) -> Iterator[str]:
 def untrained(preset: str = "paper21") -> tuple[RewardParams, Normaliser]:
     """A reward of the paper's shape with drawn weights; what it costs is as learned."""
     shape, specs = RewardConfig(), feature_map(preset).specs
-    params = pinned(init_reward(jax.random.key(0), len(specs), shape), shape)
+    params = effective_params(init_params(jax.random.key(0), len(specs), shape), shape)
     lower = jnp.asarray([spec.lower for spec in specs])
     upper = jnp.asarray([spec.upper for spec in specs])
     location = jnp.zeros(len(specs))

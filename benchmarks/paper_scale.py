@@ -30,8 +30,9 @@ from rcirl_jax.cli.running import run
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
+from rcirl_jax.reward import fit_normaliser
 from rcirl_jax.sampling import SamplerConfig, num_candidates
-from rcirl_jax.train.loop import fit_normaliser_on
+from rcirl_jax.train.featurise import normaliser_rows
 from rcirl_jax.train.parallel import parallelise
 from rcirl_jax.train.state import Batch, TrainConfig, TrainState
 from rcirl_jax.train.step import init_state, make_train_step
@@ -113,7 +114,7 @@ def main() -> None:
     with dataset_or_synthetic(_DATA.value) as path:
         dataset = open_dataset(path)
         features = feature_map(config.features)
-        normaliser = fit_normaliser_on(dataset, config, features)
+        normaliser = fit_normaliser(normaliser_rows(dataset, config), features)
         rows = dataset.load("train")
     parallel = parallelise(make_steps(config, _HOW.value, steps), _HOW.value, size)
     held = parallel.replicate((init_state(config, normaliser), rows))

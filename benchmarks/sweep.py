@@ -32,10 +32,10 @@ from rcirl_jax.evaluation.ranking.learners import normaliser_of
 from rcirl_jax.evaluation.ranking.sweep import MEMBERS_AT_ONCE
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.runtime.compiling import compiles
-from rcirl_jax.train.frozen import Members, fit, freeze, members_of
-from rcirl_jax.train.loop import to_device_batch
+from rcirl_jax.train.featurise import host_batch
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.train.step import init_state, make_train_step
+from rcirl_jax.train.sweep import Members, fit, freeze, members_of
 from tests.helpers.scenes import demonstration
 
 LEAKY_RATES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -122,7 +122,7 @@ def main(_: list[str]) -> None:
     normaliser, chunks = normaliser_of(frozen, config), _grid(config)
     single = dataclasses.replace(config, seed=0)
     state, step = init_state(config, normaliser), jax.jit(make_train_step(config))
-    batch = to_device_batch(
+    batch = host_batch(
         jax.tree.map(lambda x: x[: config.batch_size], rows),
         np.ones(config.batch_size),
         index[: config.batch_size],

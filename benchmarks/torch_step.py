@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from rcirl_jax.reward.network import layers_of
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 from rcirl_jax.types import Normaliser, RewardParams
 
@@ -54,27 +55,29 @@ def inputs_of(batch: FeatureBatch, form: str) -> Inputs:
         features = both.transpose(0, 3, 2, 1).reshape(-1, size)
     else:
         features = both.transpose(1, 0, 2, 3).reshape(size, -1)
-    own = np.asarray(batch.facts.human_density)[:, None]
-    density = np.concatenate([own, np.asarray(batch.facts.density)], axis=1)
+    own = np.asarray(batch.info.human_density)[:, None]
+    density = np.concatenate([own, np.asarray(batch.info.density)], axis=1)
     rest = (batch.feasible, batch.time_valid, batch.weight, density)
     return Inputs(*(_tensor(x) for x in (features, *rest)))
 
 
 def leaves_of(params: RewardParams) -> list[np.ndarray]:
     """Gamma, kernels, biases and the context, if there is one."""
-    more = [] if params.context is None else [params.context]
-    leaves = [params.gamma, *params.kernels, *params.biases, *more]
+    kernels, biases = layers_of(params["point"])
+    more = [params["scene_gating"]] if "scene_gating" in params else []
+    leaves = [params["gamma"], *kernels, *biases, *more]
     return [np.asarray(leaf) for leaf in leaves]
 
 
 def parameters_of(params: RewardParams) -> Weights:
     """Own copies of a network's parameters."""
     own = lambda leaf: torch.nn.Parameter(_tensor(leaf))  # noqa: E731
+    kernels, biases = layers_of(params["point"])
     return Weights(
-        gamma=own(params.gamma),
-        kernels=[own(kernel) for kernel in params.kernels],
-        biases=[own(bias) for bias in params.biases],
-        context=None if params.context is None else own(params.context),
+        gamma=own(params["gamma"]),
+        kernels=[own(kernel) for kernel in kernels],
+        biases=[own(bias) for bias in biases],
+        context=own(params["scene_gating"]) if "scene_gating" in params else None,
     )
 
 

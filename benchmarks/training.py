@@ -34,12 +34,11 @@ from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.evaluation.ranking.learners import normaliser_of
 from rcirl_jax.features import feature_map
 from rcirl_jax.runtime.compiling import wide_vectors
-from rcirl_jax.train.featurise import candidates_of
-from rcirl_jax.train.frozen import freeze
-from rcirl_jax.train.loop import host_batch
+from rcirl_jax.train.featurise import candidates_of, host_batch
 from rcirl_jax.train.parallel import parallelise
 from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
 from rcirl_jax.train.step import gradient_sums, init_state, make_train_step
+from rcirl_jax.train.sweep import freeze
 from rcirl_jax.tuning.recipes import load_recipe
 from rcirl_jax.types import Demonstration
 
@@ -160,7 +159,9 @@ def _apart(data: Data, weights: "torch_step.Weights", config: TrainConfig) -> fl
     parameters are compared elsewhere.
     """
     state, batch = data.state, jax.device_put(data.cached[0])
-    sums_of = jax.jit(lambda s, b: gradient_sums(s.params, s.normaliser, b, config))
+    sums_of = jax.jit(
+        lambda s, b: gradient_sums(s.apply_fn, s.params, s.normaliser, b, config)
+    )
     grads, sums = sums_of(state, batch)
     after = jax.jit(make_train_step(config))(state, batch)[0].params
     flat = lambda leaves: np.concatenate([np.ravel(x) for x in leaves])  # noqa: E731

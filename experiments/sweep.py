@@ -14,8 +14,7 @@ from absl import flags
 
 from rcirl_jax.cli.running import provenance, run
 from rcirl_jax.evaluation.ranking.sweep import CHOICES, SweepConfig
-from rcirl_jax.export.sweep.result import table
-from rcirl_jax.export.sweep.run import run_sweep
+from rcirl_jax.export.sweep import run_sweep, table
 from rcirl_jax.reward import LOSSES
 from rcirl_jax.runtime.executors import make_executor
 from rcirl_jax.train.state import LEARNED_FUTURES, POSITIVES, TrainConfig

@@ -15,12 +15,11 @@ from rcirl_jax.cli.running import provenance, run
 from rcirl_jax.data.store.joined import open_datasets
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.reward import LOSSES
-from rcirl_jax.reward.config import CONSTRAINTS, PINS
+from rcirl_jax.reward.network import CONSTRAINTS, PINS
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.sampling.config import MODES
-from rcirl_jax.train.loop import train
+from rcirl_jax.train.loop import Running, train
 from rcirl_jax.train.parallel import PARALLEL
-from rcirl_jax.train.running import Running
 from rcirl_jax.train.state import LEARNED_FUTURES, POSITIVES, TrainConfig
 from rcirl_jax.tuning.recipes import reward_config
 

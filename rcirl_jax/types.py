@@ -16,6 +16,7 @@ scene or ONE trajectory; batching adds leading axes by `vmap`. Host types
 
 import dataclasses
 import enum
+from collections.abc import Mapping
 from typing import Any
 
 import flax.struct
@@ -148,6 +149,21 @@ class Candidates(flax.struct.PyTreeNode, kw_only=True):
     family: jax.Array  # [K] int32, index into `sampling.FAMILIES`
 
 
+class CandidateInfo(flax.struct.PyTreeNode, kw_only=True):
+    """What losses know about the trajectories of B scenes besides their values."""
+
+    # m, the positive's mean distance to the recorded human; 0 unless it is the
+    # nearest candidate
+    human_distance: jax.Array  # [B]
+    human_collides: jax.Array  # [B] bool, of the positive; a recorded curve's is False
+    distance: jax.Array  # [B, K] m, the candidates' to the recorded human
+    collides: jax.Array  # [B, K] bool, meets a body at a valid time
+    breaks_rule: jax.Array  # [B, K] share of times over the limit; 1: ran a line
+    # log of the proposal's density at each trajectory, up to a constant per scene
+    human_density: jax.Array  # [B]
+    density: jax.Array  # [B, K]
+
+
 class Demonstration(flax.struct.PyTreeNode, kw_only=True):
     """A scene, what the human did in it, and the labels."""
 
@@ -171,21 +187,9 @@ class Normaliser(flax.struct.PyTreeNode, kw_only=True):
     scale: jax.Array  # [F] > 0
 
 
-class RewardParams(flax.struct.PyTreeNode, kw_only=True):
-    """Trainable parameters. There is no output bias: it cancels in differences."""
-
-    gamma: jax.Array  # [T] weight of each time
-    kernels: tuple[jax.Array, ...]  # [F, H1], ..., [H, 1]
-    biases: tuple[jax.Array, ...]  # [H1], ... one per hidden layer
-    # [F, F] gains of the features by the scene (`reward.module.gains`); None: none
-    context: jax.Array | None = None
-    # [] logit of the discriminator's prior, of the GAN loss only; ranks nothing
-    offset: jax.Array | None = None
-
-
-# around an R_theta of somebody else's: Flax's tree {"gamma", "point": {...}, "context",
-# "offset"}, leaves as above (see `reward.module.ValueNetwork`)
-Parameters = RewardParams | dict[str, Any]
+# the reward's parameters, raw or effective: Flax's tree {"gamma", "point", ...} of
+# `reward.network.RewardModel`
+RewardParams = Mapping[str, Any]
 
 
 # ----------------------------------------------------------------------- host

@@ -38,7 +38,7 @@ from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.evaluation.gate.types import GateConfig
 from rcirl_jax.runtime.compiling import compiles
 from rcirl_jax.runtime.executors import Serial
-from rcirl_jax.train.running import Running
+from rcirl_jax.train.loop import Running
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.tuning.loop import tune
 from rcirl_jax.tuning.recipes import TuneConfig

@@ -40,7 +40,7 @@ from rcirl_jax.report.style import (
     label,
     save,
 )
-from rcirl_jax.reward import Compared, LossConfig, loss_sums
+from rcirl_jax.reward import CandidateInfo, LossConfig, LossInputs, loss_sums
 from rcirl_jax.runtime.atomic_files import write_json
 
 _OUTPUT = flags.DEFINE_string("output", "out/background_shift", "folder to write")
@@ -132,7 +132,7 @@ def learn(loss: str, frames: Frames, start: jax.Array) -> Learned:
         minimise  loss(w, b) / terms + ridge |w|^2 / 2
 
     The rank loss has no scale of its own: there w is divided by its norm first, as
-    `reward.pinned` does, and the ridge is left out.
+    `reward.effective_params` does, and the ridge is left out.
 
     Args:
       loss: key of `reward.LOSSES` that reads values only; "gan" pools.
@@ -148,11 +148,7 @@ def learn(loss: str, frames: Frames, start: jax.Array) -> Learned:
     def total(params: tuple[jax.Array, jax.Array]) -> jax.Array:
         weights, offset = params
         used = weights / jnp.linalg.norm(weights) if unit else weights
-        compared = Compared(
-            human=human @ used,
-            candidates=candidates @ used,
-            counts=table == 0.0,
-            weight=table[:, 0] + 1.0,
+        info = CandidateInfo(
             human_distance=table[:, 0],
             human_collides=table[:, 0] > 0.0,
             distance=table,
@@ -160,6 +156,13 @@ def learn(loss: str, frames: Frames, start: jax.Array) -> Learned:
             breaks_rule=table,
             human_density=table[:, 0],
             density=table,
+        )
+        compared = LossInputs(
+            human=human @ used,
+            candidates=candidates @ used,
+            feasible=table == 0.0,
+            weight=table[:, 0] + 1.0,
+            info=info,
             offset=offset,
         )
         sums = loss_sums(loss, compared, LossConfig(leaky_rate=LEAKY_RATE))

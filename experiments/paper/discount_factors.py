@@ -27,7 +27,7 @@ from rcirl_jax.evaluation.ranking.learners import (
 from rcirl_jax.evaluation.statistics import holm
 from rcirl_jax.report.charts import curves_panel
 from rcirl_jax.report.style import figure, label, save
-from rcirl_jax.reward import pinned
+from rcirl_jax.reward import effective_params
 from rcirl_jax.units import TIMES_S
 
 ROWS = ("RC-IRL rank", "RC-IRL logistic", "GAN")
@@ -42,7 +42,9 @@ def time_weights(runs: list[Learned]) -> np.ndarray:
     The network's output may change sign together with gamma; only the product
     counts, so the sign is a convention.
     """
-    found = np.array([pinned(r.params, r.config.reward).gamma for r in runs])
+    found = np.array(
+        [effective_params(r.params, r.config.reward)["gamma"] for r in runs]
+    )
     return found * np.sign(found.sum(axis=1, keepdims=True))
 
 

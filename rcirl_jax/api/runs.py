@@ -38,8 +38,7 @@ from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.runtime.provenance import provenance
 from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.simulation.suite import case_duration, suite_refs
-from rcirl_jax.train.loop import train
-from rcirl_jax.train.running import Running
+from rcirl_jax.train.loop import Running, train
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.tuning.loop import tune as run_stages
 from rcirl_jax.tuning.recipes import (

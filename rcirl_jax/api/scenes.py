@@ -27,7 +27,7 @@ from rcirl_jax.sampling import (
     trajectory_on_path,
 )
 from rcirl_jax.sampling.sampler import MODES, family_index, within_limits
-from rcirl_jax.train.loop import in_chunks
+from rcirl_jax.train.featurise import in_chunks
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.types import Candidates, Scene, Trajectory
 from rcirl_jax.units import NUM_TIMES

@@ -25,8 +25,8 @@ from rcirl_jax.data.formats.recognise import recognised_format
 from rcirl_jax.data.importing import ImportConfig, Logs
 from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.runtime.pipeline import only_one
+from rcirl_jax.train.loop import Running
 from rcirl_jax.train.parallel import PARALLEL, share_cores
-from rcirl_jax.train.running import Running
 from rcirl_jax.tuning.loop import STAGES, tune
 from rcirl_jax.tuning.recipes import EXPERTS, TuneConfig
 from rcirl_jax.tuning.run import Run

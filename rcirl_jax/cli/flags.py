@@ -24,7 +24,7 @@ from rcirl_jax.evaluation.baselines import SEARCHES
 from rcirl_jax.evaluation.gate.types import GateConfig
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW
 from rcirl_jax.reward import LOSSES
-from rcirl_jax.reward.config import CONSTRAINTS, PINS
+from rcirl_jax.reward.network import CONSTRAINTS, PINS
 from rcirl_jax.runtime.executors import EXECUTORS, Executor, make_executor
 from rcirl_jax.sampling.sampler import MODES
 from rcirl_jax.train.state import (

@@ -20,10 +20,8 @@ from rcirl_jax.cli import flags as shared
 from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.joined import open_datasets
 from rcirl_jax.data.store.resplit import with_tags
-from rcirl_jax.train.loop import train
-from rcirl_jax.train.parallel import PARALLEL, share_cores
-from rcirl_jax.train.processes import is_first, join_processes
-from rcirl_jax.train.running import Running
+from rcirl_jax.train.loop import Running, train
+from rcirl_jax.train.parallel import PARALLEL, is_first, join_processes, share_cores
 
 USUAL = (
     *("data", "output", "recipe", "seed", "tags", "epochs", "loss", "positive"),

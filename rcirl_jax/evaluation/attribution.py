@@ -14,14 +14,14 @@ import jax
 import jax.numpy as jnp
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.reward import Normaliser, RewardParams, normalise
-from rcirl_jax.reward.module import ACTIVATIONS, network_of, variables_of
+from rcirl_jax.reward import Normaliser, RewardParams, effective_model, normalise
+from rcirl_jax.reward.network import ACTIVATIONS, layers_of, scene_values
 
 STEPS = 64  # points on the line from b to a
 
 
 def _check(
-    effective_params: RewardParams,
+    params: RewardParams,
     normaliser: Normaliser,
     features: jax.Array,
     time_valid: jax.Array,
@@ -33,7 +33,10 @@ def _check(
             f"attribute: activation: {activation}: expected one of"
             f" {sorted(ACTIVATIONS)}"
         )
-    expected = (effective_params.gamma.shape[0], effective_params.kernels[0].shape[0])
+    expected = (
+        params["gamma"].shape[0],
+        layers_of(params["point"])[0][0].shape[0],
+    )
     if features.shape != expected:
         raise InputError(
             f"attribute: features: shape {features.shape}: expected T, F = {expected}"
@@ -51,7 +54,7 @@ def _check(
 
 
 def attribute(
-    effective_params: RewardParams,
+    params: RewardParams,
     normaliser: Normaliser,
     features_a: jax.Array,
     features_b: jax.Array,
@@ -71,7 +74,7 @@ def attribute(
     space of `steps` copies of [T, F].
 
     Args:
-      effective_params: pinned parameters (`reward.pinned`, or a weights file's).
+      params: effective ones (`reward.effective_params`, or a weights file's).
       normaliser: [F].
       features_a: [T, F] in declared units, of the trajectory to be explained.
       features_b: [T, F] in declared units, of the one it is compared with.
@@ -92,7 +95,7 @@ def attribute(
             f"attribute: features: shapes {features_a.shape}, {features_b.shape}:"
             " expected [T, F] for both"
         )
-    _check(effective_params, normaliser, features_a, time_valid, activation)
+    _check(params, normaliser, features_a, time_valid, activation)
     if steps < 1:
         raise InputError(f"attribute: steps: {steps}: expected at least 1")
     start = normalise(normaliser, features_b)
@@ -102,9 +105,15 @@ def attribute(
     )
     # exactly 0 where the network sees no difference
     change = (clipped_a - clipped_b) / normaliser.scale
-    network = network_of(effective_params, activation)
-    variables = variables_of(effective_params)
-    total = lambda x: network.apply(variables, x, time_valid)  # noqa: E731
+    model = effective_model(params, activation)
+    # x is normalised already
+    ones, bound = jnp.ones(start.shape[1]), jnp.full(start.shape[1], jnp.inf)
+    as_is = Normaliser(lower=-bound, upper=bound, location=0.0 * ones, scale=ones)
+
+    def total(x: jax.Array) -> jax.Array:
+        rows = x.T[:, :, None]
+        return scene_values(model, params, as_is, time_valid, rows)[0][0]
+
     shares = (jnp.arange(steps) + 0.5) / steps
     slopes = jax.vmap(lambda share: jax.grad(total)(start + share * change))(shares)
     contribution = change * jnp.mean(slopes, axis=0)

@@ -3,7 +3,7 @@
 import datetime
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,18 +16,18 @@ from rcirl_jax.export.weights import FeatureSpec, RewardWeights, save
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import (
     Normaliser,
+    RewardModel,
     RewardParams,
-    pinned,
+    effective_params,
     seen_range,
     value,
 )
-from rcirl_jax.reward.module import LEAKY_SLOPE
+from rcirl_jax.reward.network import LEAKY_SLOPE, layers_of
 from rcirl_jax.runtime.atomic_files import read_json
 from rcirl_jax.runtime.checked import typed_settings
-from rcirl_jax.train.featurise import featurised
-from rcirl_jax.train.loop import normaliser_rows, restore_run, to_device_batch
+from rcirl_jax.train.featurise import featurised, host_batch, normaliser_rows
+from rcirl_jax.train.loop import restore_run
 from rcirl_jax.train.metrics import read_metrics
-from rcirl_jax.train.running import of_today
 from rcirl_jax.train.state import TrainConfig, TrainState
 from rcirl_jax.units import TIMES_S
 
@@ -42,8 +42,6 @@ def _config_of(settings: Mapping[str, Any]) -> TrainConfig:
     """
     for name in ("reward", "sampler"):
         settings[name]  # these are no flags with a default
-    # runs of before the planner's prediction learned from the record
-    settings = {"futures": "recorded", "admissible_in": "none", **of_today(settings)}
     return typed_settings(TrainConfig, settings)
 
 
@@ -95,7 +93,8 @@ def reward_weights(
 ) -> RewardWeights:
     """The effective weights of trained parameters, as the file holds them."""
     features = feature_map(config.features)
-    effective = pinned(params, config.reward)
+    effective = effective_params(params, config.reward)
+    kernels, biases = layers_of(effective["point"])
     return RewardWeights(
         preset=config.features,
         features=tuple(
@@ -107,12 +106,14 @@ def reward_weights(
         location=np.asarray(normaliser.location),
         scale=np.asarray(normaliser.scale),
         times=TIMES_S,
-        gamma=np.asarray(effective.gamma),
-        kernels=tuple(np.asarray(kernel) for kernel in effective.kernels),
-        context=None if effective.context is None else np.asarray(effective.context),
+        gamma=np.asarray(effective["gamma"]),
+        kernels=tuple(np.asarray(kernel) for kernel in kernels),
+        context=np.asarray(effective["scene_gating"])
+        if "scene_gating" in effective
+        else None,
         seen=seen,
         prior_cost=prior_cost,
-        biases=(*(np.asarray(bias) for bias in effective.biases), np.zeros(1)),
+        biases=(*(np.asarray(bias) for bias in biases), np.zeros(1)),
         activation=config.reward.hidden_activation,
         leaky_slope=LEAKY_SLOPE,
         loss={
@@ -157,7 +158,7 @@ def export_run(
     seen = seen_range(rows, feature_map(config.features))
     return write_weights(
         output,
-        cast("RewardParams", state.params),
+        state.params,
         state.normaliser,
         config,
         verification_samples(dataset, config),
@@ -192,7 +193,7 @@ def write_weights(
       prior_cost: of a reward driven on top of an incumbent.
     """
     x, valid = map(jnp.asarray, samples)
-    values = value(params, normaliser, x, valid, config.reward)
+    values = value(RewardModel(config.reward), params, normaliser, x, valid)
     weights = reward_weights(
         params, normaliser, config, provenance, seen, prior_cost=prior_cost
     )
@@ -206,7 +207,7 @@ def verification_samples(
     """[m, T, F] features and [m, T] masks: half humans, half candidates."""
     count = min(NUM_SAMPLES // 2, dataset.indices("train").size)
     index = dataset.indices("train")[:count]
-    batch = to_device_batch(dataset.read(index), np.ones(count), index)
+    batch = jax.device_put(host_batch(dataset.read(index), np.ones(count), index))
     key = jax.random.key(config.seed)
     made = featurised(key, batch, config)
     human, candidates = np.asarray(made.human), np.asarray(made.points)

@@ -14,8 +14,9 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.score import PriorCostScorer
 from rcirl_jax.export.reader import PriorCost, Reward, WeightsError, load_weights
 from rcirl_jax.features.mapping import FeatureMap, feature_map, known_presets
+from rcirl_jax.reward import effective_model, value
 from rcirl_jax.reward.familiarity import Familiarity
-from rcirl_jax.reward.module import LEAKY_SLOPE, module_value, network_of, variables_of
+from rcirl_jax.reward.network import LEAKY_SLOPE, point_of
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Normaliser, RewardParams
 
@@ -92,16 +93,14 @@ def reward_params(reward: Reward) -> tuple[RewardParams, Normaliser]:
         raise InputError(
             f"{reward.file}: leaky_slope: {reward.leaky_slope}: expected {LEAKY_SLOPE}"
         )
-    tables = lambda arrays: tuple(jnp.asarray(x, jnp.float32) for x in arrays)  # noqa: E731
+    gated = {} if reward.context is None else {"scene_gating": reward.context}
+    params = {
+        "gamma": reward.gamma,
+        "point": point_of(list(reward.kernels), list(reward.biases[:-1])),
+        **gated,
+    }
     return (
-        RewardParams(
-            gamma=jnp.asarray(reward.gamma, jnp.float32),
-            kernels=tables(reward.kernels),
-            biases=tables(reward.biases[:-1]),
-            context=None
-            if reward.context is None
-            else jnp.asarray(reward.context, jnp.float32),
-        ),
+        jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), params),
         Normaliser(
             lower=jnp.asarray(reward.lower, jnp.float32),
             upper=jnp.asarray(reward.upper, jnp.float32),
@@ -153,8 +152,8 @@ def _value(
     valid: jax.Array,
     activation: str,
 ) -> jax.Array:
-    network, variables = network_of(effective, activation), variables_of(effective)
-    return module_value(network, variables, normaliser, x, valid)
+    model = effective_model(effective, activation)
+    return value(model, effective, normaliser, x, jnp.broadcast_to(valid, x.shape[:-1]))
 
 
 def row_name(reward: Reward) -> str:

@@ -41,7 +41,7 @@ from rcirl_jax.planner.rank import (
     learned_score,
     with_plan_in_force,
 )
-from rcirl_jax.reward.module import product
+from rcirl_jax.reward.network import matmul_f32
 from rcirl_jax.sampling import sample
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.sampling.sampler import family_index
@@ -243,7 +243,7 @@ def _first_step(
     near = (off <= config.first_reach) | (m == jnp.argmin(off))
     free = near & ~lattice.blocked[1, m]
     clipped = jnp.clip(lattice.first_row, layers.lower, layers.upper)
-    start = product(clipped, layers.first) + layers.offset
+    start = matmul_f32(clipped, layers.first) + layers.offset
     ahead = _next_values(values, lattice.blocked[2])
     scores = []
     for i, k in enumerate(config.actions):

@@ -32,7 +32,12 @@ from rcirl_jax.features import FeatureMap
 from rcirl_jax.features.path import path_view
 from rcirl_jax.planner.safety import SafetyConfig
 from rcirl_jax.reward import normalise
-from rcirl_jax.reward.module import ACTIVATIONS, gains, product
+from rcirl_jax.reward.network import (
+    ACTIVATIONS,
+    feature_gates,
+    layers_of,
+    matmul_f32,
+)
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.types import (
     Candidates,
@@ -158,7 +163,7 @@ def make_lattice(
         speed_cap=_speed_cap(scene, limit, config),
         first=jax.tree.map(lambda x: x[0], start),
         first_row=features(scene, start)[0],
-        weight=jnp.where(valid, weights[0].gamma, 0.0),
+        weight=jnp.where(valid, weights[0]["gamma"], 0.0),
         has_next=jnp.concatenate([valid[1:], jnp.zeros((1,), bool)]),
     )
 
@@ -215,16 +220,18 @@ class Layers(flax.struct.PyTreeNode, kw_only=True):
 def make_layers(weights: Weights, features: FeatureMap, first_row: jax.Array) -> Layers:
     """Fold the normaliser into the first layer and take a and j out of it.
 
-    `first_row` [F], the features at t = 0, sets the gains of a conditioned reward.
+    `first_row` [F], the features at t = 0, sets the gates of a gated reward.
     """
     params, norm = weights
-    first = params.kernels[0] / norm.scale[:, None]
-    if params.context is not None:
-        first = gains(params.context, normalise(norm, first_row))[:, None] * first
-    bias = params.biases[0] if params.biases else jnp.zeros((1,))
+    kernels, biases = layers_of(params["point"])
+    first = kernels[0] / norm.scale[:, None]
+    if "scene_gating" in params:
+        start = normalise(norm, first_row)
+        first = feature_gates(params["scene_gating"], start)[:, None] * first
+    bias = biases[0] if biases else jnp.zeros((1,))
     none, open_bounds = jnp.zeros(first.shape[1]), jnp.array([-jnp.inf, jnp.inf])
     parts = {"acceleration": (none, open_bounds), "jerk": (none, open_bounds)}
-    offset = bias - product(norm.location, first)
+    offset = bias - matmul_f32(norm.location, first)
     for name in parts:
         if name in features.names:
             i = features.names.index(name)
@@ -239,8 +246,8 @@ def make_layers(weights: Weights, features: FeatureMap, first_row: jax.Array) ->
         upper=norm.upper,
         bounds_a=parts["acceleration"][1],
         bounds_j=parts["jerk"][1],
-        kernels=params.kernels[1:],
-        biases=params.biases[1:],
+        kernels=tuple(kernels[1:]),
+        biases=tuple(biases[1:]),
     )
 
 
@@ -249,8 +256,8 @@ def rest_of_network(layers: Layers, x: jax.Array, activation: str) -> jax.Array:
     if not layers.kernels:
         return x[..., 0]
     for kernel, bias in zip(layers.kernels[:-1], layers.biases, strict=True):
-        x = product(ACTIVATIONS[activation](x), kernel) + bias
-    return product(ACTIVATIONS[activation](x), layers.kernels[-1])[..., 0]
+        x = matmul_f32(ACTIVATIONS[activation](x), kernel) + bias
+    return matmul_f32(ACTIVATIONS[activation](x), layers.kernels[-1])[..., 0]
 
 
 def base_activation(
@@ -263,7 +270,7 @@ def base_activation(
     v = v[None, :, None]
     x = c0[:, None] + c1[:, None] * v + c2[:, None] * v**2
     x = jnp.clip(x, layers.lower, layers.upper)
-    return product(x, layers.first) + layers.offset
+    return matmul_f32(x, layers.first) + layers.offset
 
 
 def motion_activation(layers: Layers, a: jax.Array, j: jax.Array) -> jax.Array:

@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 
 from rcirl_jax.features import FeatureMap
-from rcirl_jax.planner.rank import Params, Score
+from rcirl_jax.planner.rank import Params, Score, value_rows
+from rcirl_jax.reward import effective_model
 from rcirl_jax.reward.familiarity import Familiarity, familiarity
-from rcirl_jax.reward.fast import rows_value
 from rcirl_jax.types import Candidates, Normaliser, RewardParams, Scene
 
 
@@ -45,8 +45,11 @@ def prior_cost_score(features: FeatureMap, activation: str, own: Score) -> Score
     """Score of `WithPriorCost`, by the equation of the module."""
 
     def score(params: WithPriorCost, scene: Scene, candidates: Candidates) -> jax.Array:
-        rows, valid = features.rows(scene, candidates), scene.time_valid
-        values = rows_value(params.reward, params.normaliser, rows, valid, activation)
+        rows, model = (
+            features.rows(scene, candidates),
+            effective_model(params.reward, activation),
+        )
+        values = value_rows(model, params.reward, params.normaliser, rows, scene)
         return own(params.own, scene, candidates) + gain(params, rows) * values
 
     return score

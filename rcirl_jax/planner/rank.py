@@ -7,7 +7,7 @@ and the tracking are the same for a learned, a hand-set and a random reward.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -18,9 +18,13 @@ from rcirl_jax.planner.baselines import Idm, idm_acceleration
 from rcirl_jax.planner.commitment import InForce, committed
 from rcirl_jax.planner.plan import Plan, held, plan_of
 from rcirl_jax.planner.safety import SafetyConfig, check, choose
-from rcirl_jax.reward.fast import rows_value
 from rcirl_jax.reward.hand import LatticeCost, lattice_costs
-from rcirl_jax.reward.module import ACTIVATIONS, ValueNetwork, module_value
+from rcirl_jax.reward.network import (
+    ACTIVATIONS,
+    RewardModel,
+    effective_model,
+    scene_values,
+)
 from rcirl_jax.reward.speed_dp import speed_dp_cost
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.sampling.sampler import family_index
@@ -62,6 +66,18 @@ class RankConfig:
     commitment: float = 1.0
 
 
+def value_rows(
+    model: RewardModel,
+    params: RewardParams,
+    normaliser: Normaliser,
+    rows: Sequence[jax.Array],
+    scene: Scene,
+) -> jax.Array:
+    """V [K] of a scene's candidates from F rows [T, K] of `FeatureMap.rows`."""
+    x, valid = jnp.stack(rows), scene.time_valid
+    return scene_values(model, params, normaliser, valid, x)[0]
+
+
 @functools.lru_cache(maxsize=16)
 def learned_score(features: FeatureMap, activation: str) -> Score:
     """Score of (effective RewardParams, Normaliser): V, as in `reward.value`."""
@@ -71,27 +87,20 @@ def learned_score(features: FeatureMap, activation: str) -> Score:
     def score(
         params: tuple[RewardParams, Normaliser], scene: Scene, candidates: Candidates
     ) -> jax.Array:
-        effective, normaliser = params
-        rows = features.rows(scene, candidates)
-        return rows_value(effective, normaliser, rows, scene.time_valid, activation)
+        model = effective_model(params[0], activation)
+        return value_rows(model, *params, features.rows(scene, candidates), scene)
 
     return score
 
 
 @functools.lru_cache(maxsize=16)
-def module_score(features: FeatureMap, network: ValueNetwork) -> Score:
-    """Score of (variables, Normaliser): V of any module, by its own `apply`.
-
-    `reward.effective_network` gives the module and the variables of a training.
-    """
+def module_score(features: FeatureMap, model: RewardModel) -> Score:
+    """Score of (parameters of a training, Normaliser): V of any R_theta."""
 
     def score(
-        params: tuple[dict, Normaliser], scene: Scene, candidates: Candidates
+        params: tuple[RewardParams, Normaliser], scene: Scene, candidates: Candidates
     ) -> jax.Array:
-        variables, normaliser = params
-        x = features.of_candidates(scene, candidates)
-        valid = jnp.broadcast_to(scene.time_valid, x.shape[:-1])
-        return module_value(network, variables, normaliser, x, valid)
+        return value_rows(model, *params, features.rows(scene, candidates), scene)
 
     return score
 

@@ -31,7 +31,7 @@ from rcirl_jax.evaluation.ranking.report import (
 )
 from rcirl_jax.evaluation.statistics import CONFIDENCE
 from rcirl_jax.export.reader import Reward
-from rcirl_jax.export.sweep.result import table as sweep_table
+from rcirl_jax.export.sweep import table as sweep_table
 from rcirl_jax.report.charts import forest_axis, forest_cell, sweep_picture, time_curves
 from rcirl_jax.report.features import features_view
 from rcirl_jax.report.frames import draw_frames, draw_training

@@ -1,8 +1,5 @@
-"""The learned reward: network, normaliser, losses, and the hand-set baselines."""
+"""The learned reward: Flax module, normaliser, losses, hand-set costs."""
 
-from rcirl_jax.reward.config import RewardConfig
-from rcirl_jax.reward.constraints import pinned
-from rcirl_jax.reward.fast import scenes_value
 from rcirl_jax.reward.hand import (
     LONG_ROW,
     TUNABLE,
@@ -16,21 +13,22 @@ from rcirl_jax.reward.hand import (
 )
 from rcirl_jax.reward.losses import (
     LOSSES,
-    Compared,
     LossConfig,
+    LossInputs,
     LossSums,
     loss_sums,
 )
-from rcirl_jax.reward.module import PointReward, ValueNetwork
 from rcirl_jax.reward.network import (
-    effective_network,
-    init_reward,
-    init_tree,
+    RewardConfig,
+    RewardModel,
+    effective_model,
+    effective_params,
+    init_params,
     value,
 )
 from rcirl_jax.reward.normaliser import fit_normaliser, normalise, seen_range
 from rcirl_jax.reward.speed_dp import SPEED_DP_ROW, SpeedDpCost, speed_dp_cost
-from rcirl_jax.types import Normaliser, Parameters, RewardParams
+from rcirl_jax.types import CandidateInfo, Normaliser, RewardParams
 
 __all__ = [
     "LONG_ROW",
@@ -38,28 +36,25 @@ __all__ = [
     "SPEED_DP_ROW",
     "TUNABLE",
     "TUNED_ROW",
-    "Compared",
+    "CandidateInfo",
     "LatticeCost",
     "LossConfig",
+    "LossInputs",
     "LossSums",
     "Normaliser",
-    "Parameters",
-    "PointReward",
     "RewardConfig",
+    "RewardModel",
     "RewardParams",
     "SpeedDpCost",
-    "ValueNetwork",
-    "effective_network",
+    "effective_model",
+    "effective_params",
     "fit_normaliser",
-    "init_reward",
-    "init_tree",
+    "init_params",
     "lattice_cost",
     "lattice_costs",
     "lattice_terms",
     "loss_sums",
     "normalise",
-    "pinned",
-    "scenes_value",
     "seen_range",
     "speed_dp_cost",
     "tuned",

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from rcirl_jax.types import CandidateInfo
+
 MARGIN_CEILING_M = 10.0  # m, distance beyond which the hinge asks for no more
 
 
@@ -36,23 +38,14 @@ class LossConfig:
     soft_distance: float = 1.0
 
 
-class Compared(NamedTuple):
-    """Values of B scenes and what the losses know about their candidates."""
+class LossInputs(NamedTuple):
+    """Values of the trajectories of B scenes, and what losses know about them."""
 
     human: Float[Array, " b"]  # V of the positive
     candidates: Float[Array, "b k"]  # V
-    counts: Bool[Array, "b k"]  # feasible candidates
+    feasible: Bool[Array, "b k"]  # candidates that count
     weight: Float[Array, " b"]  # 0 for padding rows
-    # m, mean distance to the recorded human; the positive's own is 0 unless it
-    # is the nearest candidate
-    human_distance: Float[Array, " b"]
-    human_collides: Bool[Array, " b"]
-    distance: Float[Array, "b k"]
-    collides: Bool[Array, "b k"]
-    breaks_rule: Float[Array, "b k"]  # share of times over the limit; 1: ran a line
-    # log of the proposal's density at each trajectory, up to a constant per scene
-    human_density: Float[Array, " b"]
-    density: Float[Array, "b k"]
+    info: CandidateInfo
     offset: Float[Array, ""]  # of the discriminator
 
 
@@ -69,7 +62,8 @@ def rank_loss(y: Float[Array, "*n"], leaky_rate: ArrayLike) -> Float[Array, "*n"
     """The paper's leaky-ReLU rank loss: L(y) = y if y >= 0 else a y, a = 0.05.
 
     A candidate valued above the human costs its lead; one below earns a small
-    reward for its distance. Needs a pinned scale (`reward.pinned`).
+    reward for its distance. Needs a fixed scale
+    (`network.effective_params`).
     """
     return jnp.where(y >= 0.0, y, leaky_rate * y)
 
@@ -79,29 +73,29 @@ def logistic_loss(y: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jax.nn.softplus(y)
 
 
-def task_margin(c: Compared, config: LossConfig) -> Float[Array, "b k"]:
+def task_margin(c: LossInputs, config: LossConfig) -> Float[Array, "b k"]:
     """Lead that the human must have: far, colliding and unlawful ones more.
 
         margin = m_d min(distance, ceiling) + m_c collides + m_r breaks_rule
 
     Source: Ratliff et al. (ICML 2006), with the task loss of Sadat et al. (2019).
     """
-    near = jnp.minimum(c.distance, MARGIN_CEILING_M)
+    near = jnp.minimum(c.info.distance, MARGIN_CEILING_M)
     return (
         config.margin_distance * near
-        + config.margin_collision * c.collides
-        + config.margin_rule * c.breaks_rule
+        + config.margin_collision * c.info.collides
+        + config.margin_rule * c.info.breaks_rule
     )
 
 
-def _over_pairs(c: Compared, per_pair: jax.Array) -> tuple[jax.Array, jax.Array]:
-    share = c.counts * c.weight[:, None]
-    return jnp.sum(jnp.where(c.counts, per_pair, 0.0) * share), jnp.sum(share)
+def _over_pairs(c: LossInputs, per_pair: jax.Array) -> tuple[jax.Array, jax.Array]:
+    share = c.feasible * c.weight[:, None]
+    return jnp.sum(jnp.where(c.feasible, per_pair, 0.0) * share), jnp.sum(share)
 
 
-def _over_scenes(c: Compared, per_scene: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _over_scenes(c: LossInputs, per_scene: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Scenes without a feasible candidate compare nothing."""
-    share = jnp.where(jnp.any(c.counts, axis=1), c.weight, 0.0)
+    share = jnp.where(jnp.any(c.feasible, axis=1), c.weight, 0.0)
     return jnp.sum(jnp.where(share > 0.0, per_scene, 0.0) * share), jnp.sum(share)
 
 
@@ -110,27 +104,27 @@ def _all(human: jax.Array, candidates: jax.Array) -> jax.Array:
     return jnp.concatenate([human[:, None], candidates], axis=1)
 
 
-def _counted(c: Compared) -> jax.Array:
-    return _all(jnp.ones(c.human.shape, bool), c.counts)
+def _counted(c: LossInputs) -> jax.Array:
+    return _all(jnp.ones(c.human.shape, bool), c.feasible)
 
 
-def _rank(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
+def _rank(c: LossInputs, config: LossConfig) -> tuple[jax.Array, jax.Array]:
     y = c.candidates - c.human[:, None]
     return _over_pairs(c, rank_loss(y, config.leaky_rate))
 
 
-def _logistic(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
+def _logistic(c: LossInputs, config: LossConfig) -> tuple[jax.Array, jax.Array]:
     del config
     return _over_pairs(c, logistic_loss(c.candidates - c.human[:, None]))
 
 
-def _hinge(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
+def _hinge(c: LossInputs, config: LossConfig) -> tuple[jax.Array, jax.Array]:
     """L = max(0, y + margin), mean over pairs."""
     y = c.candidates - c.human[:, None]
     return _over_pairs(c, jax.nn.relu(y + task_margin(c, config)))
 
 
-def _listwise(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
+def _listwise(c: LossInputs, config: LossConfig) -> tuple[jax.Array, jax.Array]:
     """MaxEnt IRL: -log of the human's share of a sampled partition function.
 
         P(human) = exp(V_h) / Z,   Z = sum over {human} + candidates of exp(V) / q
@@ -140,14 +134,14 @@ def _listwise(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
     """
     del config
     counted = _counted(c)
-    log_q = jnp.where(counted, _all(c.human_density, c.density), 0.0)
+    log_q = jnp.where(counted, _all(c.info.human_density, c.info.density), 0.0)
     mean = jnp.sum(log_q, axis=1) / jnp.sum(counted, axis=1)
     logits = _all(c.human, c.candidates) - (log_q - mean[:, None])
     log_z = jax.nn.logsumexp(jnp.where(counted, logits, -jnp.inf), axis=1)
     return _over_scenes(c, log_z - c.human)
 
 
-def _soft(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
+def _soft(c: LossInputs, config: LossConfig) -> tuple[jax.Array, jax.Array]:
     """Cross-entropy with labels softmax(-distance / tau) over the whole set.
 
     Near candidates share the label unless they collide, which is no good answer
@@ -155,16 +149,16 @@ def _soft(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
     candidate as the positive, the human curve itself is not in the set.
     """
     counted = _counted(c)
-    good = counted & ~_all(c.human_collides, c.collides)
+    good = counted & ~_all(c.info.human_collides, c.info.collides)
     good = jnp.where(jnp.any(good, axis=1, keepdims=True), good, counted)
-    apart = _all(c.human_distance, c.distance) / config.soft_distance
+    apart = _all(c.info.human_distance, c.info.distance) / config.soft_distance
     labels = jax.nn.softmax(jnp.where(good, -apart, -jnp.inf), axis=1)
     values = jnp.where(counted, _all(c.human, c.candidates), -jnp.inf)
     log_p = jnp.where(counted, jax.nn.log_softmax(values, axis=1), 0.0)
     return _over_scenes(c, -jnp.sum(labels * log_p, axis=1))
 
 
-def _gan(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
+def _gan(c: LossInputs, config: LossConfig) -> tuple[jax.Array, jax.Array]:
     """The paper's GAN baseline: a discriminator that never compares in a scene.
 
         L = log(1 + exp(-(V_h + b))) + mean_k log(1 + exp(V_k + b))
@@ -174,12 +168,12 @@ def _gan(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
     """
     del config
     real = jax.nn.softplus(-(c.human + c.offset))
-    fake = jnp.where(c.counts, jax.nn.softplus(c.candidates + c.offset), 0.0)
-    mean = jnp.sum(fake, axis=1) / jnp.maximum(jnp.sum(c.counts, axis=1), 1)
+    fake = jnp.where(c.feasible, jax.nn.softplus(c.candidates + c.offset), 0.0)
+    mean = jnp.sum(fake, axis=1) / jnp.maximum(jnp.sum(c.feasible, axis=1), 1)
     return _over_scenes(c, real + mean)
 
 
-LOSSES: dict[str, Callable[[Compared, LossConfig], tuple[jax.Array, jax.Array]]] = {
+LOSSES: dict[str, Callable[[LossInputs, LossConfig], tuple[jax.Array, jax.Array]]] = {
     "rank": _rank,
     "logistic": _logistic,
     "hinge": _hinge,
@@ -189,19 +183,19 @@ LOSSES: dict[str, Callable[[Compared, LossConfig], tuple[jax.Array, jax.Array]]]
 }
 
 
-def loss_sums(name: str, compared: Compared, config: LossConfig) -> LossSums:
+def loss_sums(name: str, inputs: LossInputs, config: LossConfig) -> LossSums:
     """A loss with its count, and how many pairs the human wins.
 
     Args:
       name: key of `LOSSES`.
-      compared: values and facts of B scenes.
+      inputs: values of B scenes.
       config: constants.
 
     Returns:
       Scalars; divide only after summing over all shards.
     """
-    loss, terms = LOSSES[name](compared, config)
-    y = compared.candidates - compared.human[:, None]
-    share = compared.counts * compared.weight[:, None]
+    loss, terms = LOSSES[name](inputs, config)
+    y = inputs.candidates - inputs.human[:, None]
+    share = inputs.feasible * inputs.weight[:, None]
     wins = jnp.sum(share * jnp.where(y < 0.0, 1.0, jnp.where(y == 0.0, 0.5, 0.0)))
     return LossSums(loss=loss, terms=terms, wins=wins, pairs=jnp.sum(share))

@@ -25,7 +25,7 @@ from rcirl_jax.planner.rank import (
     velocity_score,
 )
 from rcirl_jax.planner.yielding import Yielding, yielding_policy
-from rcirl_jax.reward import RewardConfig, init_reward, pinned
+from rcirl_jax.reward import RewardConfig, effective_params, init_params
 from rcirl_jax.reward.speed_dp import SPEED_DP_ROW
 from rcirl_jax.types import Normaliser, RewardParams
 
@@ -99,7 +99,7 @@ def baseline_row(
     if name == "random weights":
         shape = RewardConfig()
         count = feature_map(preset).num_features
-        params = init_reward(jax.random.key(0), count, shape)
-        weights = (pinned(params, shape), normaliser)
+        params = init_params(jax.random.key(0), count, shape)
+        weights = (effective_params(params, shape), normaliser)
         return learned_row(name, weights, preset, shape.activation, config)
     raise InputError(f"baselines: {name}: expected some of {', '.join(BASELINES)}")

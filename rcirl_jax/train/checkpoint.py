@@ -1,8 +1,8 @@
 """Checkpoints by orbax, which only this module imports.
 
     checkpoints/STEP/              as orbax writes it, under another name until whole
-    checkpoints/STEP/position.json copy of the data position; by this module, then
-    checkpoints/STEP/sha256.json   digests of all its files
+    checkpoints/STEP/position.json the data position; by this module, then
+    checkpoints/STEP/sha256.json   digests of all its files: it is finished
     checkpoints/STEP.damaged/      put aside by a run that went on from an older one
 
 orbax keeps no checksum of the arrays: the digests find what changed on disk.
@@ -26,14 +26,13 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import read_json, write_json
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.runtime.pipeline import digest, file_sha256
-from rcirl_jax.train.processes import is_first
+from rcirl_jax.train.parallel import is_first
 from rcirl_jax.train.state import TrainState
 
 KEEP_LATEST = 3  # checkpoints kept
 DIGESTS = "sha256.json"
 POSITION = "position.json"
 DAMAGED = ".damaged"
-SEALED = ".sealed"  # in folders whose finished checkpoints all have digests
 PROBE = ".room"
 OVERHEAD_BYTES = 2**17  # of a checkpoint's files besides the arrays
 
@@ -41,9 +40,9 @@ OVERHEAD_BYTES = 2**17  # of a checkpoint's files besides the arrays
 class Checkpoints:
     """Saves and restores (TrainState, data position) under one folder.
 
-    Saving is asynchronous; the data position travels as the checkpoint's own
-    metadata, so that a resumed run sees the same batches in the same order. A copy lies
-    beside the state, because orbax never frees the memory of metadata that it reads.
+    Saving is asynchronous. The data position makes a resumed run see the same batches
+    in the same order; it lies beside orbax's files, because orbax never frees the
+    memory of metadata that it reads.
 
     `passed_over` has one line for each checkpoint that is newer than the newest
     whole one, which is the one to go on from.
@@ -71,8 +70,6 @@ class Checkpoints:
         ]
         if not read_only:
             _put_aside(self._folder, list(bad))
-            if self._newest is None and is_first():
-                (self._folder / SEALED).touch()
         keep: Any = ocp.training.preservation_policies.LatestN(KEEP_LATEST)
         self._checkpointer = ocp.training.Checkpointer(
             str(self._folder),
@@ -100,9 +97,7 @@ class Checkpoints:
             self._finish_pending()
             if is_first():
                 _check_room(self._folder, state)
-            response: Any = self._checkpointer.save_async(
-                step, state, force=True, custom_metadata={"position": position}
-            )
+            response: Any = self._checkpointer.save_async(step, state, force=True)
             self._pending = self._thread.submit(self._seal, step, response, position)
 
     def _seal(self, step: int, response: Any, position: dict) -> None:  # noqa: ANN401
@@ -138,12 +133,7 @@ class Checkpoints:
                 f"{self._folder}: checkpoint {step}: {_first_line(error)}: "
                 "expected the same features, hidden size and optimiser"
             ) from error
-        path = self._folder / str(step) / POSITION
-        if path.exists():
-            return state, read_position(path)
-        # of a version before, or killed before the copy was written
-        metadata: Any = self._checkpointer.metadata(step).custom_metadata or {}
-        return state, dict(metadata.get("position", {}))
+        return state, read_position(self._folder / str(step) / POSITION)
 
     def close(self) -> None:
         """Wait for pending saves and release the folder.
@@ -206,20 +196,18 @@ def _newest_whole(folder: Path) -> tuple[int | None, dict[int, str]]:
     """The newest whole checkpoint, and what is wrong with each newer one.
 
     Raises:
-      InputError: there are some, and none is whole.
+      InputError: there are finished ones, and none is whole.
     """
     names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
     steps = sorted((int(name) for name in names if name.isdecimal()), reverse=True)
-    if not any((folder / str(step) / DIGESTS).exists() for step in steps):
-        if (folder / SEALED).exists():  # killed while it wrote the first ones
-            return None, {step: f"{DIGESTS}: missing, not finished" for step in steps}
-        return (steps[0] if steps else None), {}  # of a version without digests
     bad: dict[int, str] = {}
     for step in steps:
         why = _damage(folder / str(step))
         if why is None:
             return step, bad
         bad[step] = why
+    if not any((folder / str(step) / DIGESTS).exists() for step in steps):
+        return None, bad  # killed while it wrote the first ones
     reasons = "; ".join(f"{step}: {why}" for step, why in bad.items())
     raise InputError(
         f"{folder}: checkpoint {reasons}: expected one that is whole; use another "

@@ -2,126 +2,124 @@
 
 restore or init -> for each batch: step, guard, log -> checkpoint every epoch, and
 when the process is told to end (`interrupts`).
-With several processes (`train.processes`) each reads and computes its part of every
+With several processes (`train.parallel`) each reads and computes its part of every
 batch; process 0 alone writes run.json and metrics.
 """
 
 import contextlib
 import dataclasses
 import functools
+import json
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 
 from rcirl_jax.data.store.batches import Prefetch, split_batches
 from rcirl_jax.data.store.joined import Demonstrations
-from rcirl_jax.data.store.rows import check_finite
+from rcirl_jax.data.store.rows import scene_name, unusable_leaves
 from rcirl_jax.errors import InputError
-from rcirl_jax.features import FeatureMap, feature_map
-from rcirl_jax.reward import Normaliser, fit_normaliser, pinned
+from rcirl_jax.features import feature_map
+from rcirl_jax.reward import Normaliser, effective_params, fit_normaliser
+from rcirl_jax.runtime.atomic_files import read_json, write_whole
 from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.runtime.signals import Interrupted, asked
 from rcirl_jax.train.checkpoint import Checkpoints
-from rcirl_jax.train.featurise import featurised
-from rcirl_jax.train.finite import check_features, check_step
+from rcirl_jax.train.featurise import (
+    featurised,
+    host_batch,
+    normaliser_rows,
+    not_finite,
+)
 from rcirl_jax.train.metrics import MetricsWriter, Progress
-from rcirl_jax.train.parallel import Parallel, Step, parallelise
-from rcirl_jax.train.processes import all_stop_after, is_first, with_the_others
-from rcirl_jax.train.running import Running, check_run, describe_run
-from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
+from rcirl_jax.train.parallel import (
+    Parallel,
+    Step,
+    all_stop_after,
+    exit_if_peer_lost,
+    is_first,
+    parallelise,
+)
+from rcirl_jax.train.state import TrainConfig, TrainState
 from rcirl_jax.train.step import StepMetrics, init_state, make_train_step
 from rcirl_jax.train.trackers import settings_of, time_weights, trackers
-from rcirl_jax.types import Demonstration, RewardParams
-
-CHUNK = 128  # scenes featurised per call where no batch sets their number
-NORMALISER_SCENES = 2048  # training scenes whose features fit the normaliser
-NORMALISER_STREAM = 7  # fold_in number of the key that samples for the normaliser
 
 
-def to_device_batch(
-    demonstrations: Demonstration, weight: np.ndarray, index: np.ndarray
-) -> Batch:
-    """Numpy rows -> a Batch on the default device."""
-    return jax.device_put(host_batch(demonstrations, weight, index))
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Running:
+    """How a run goes about its work; nothing here changes its result."""
+
+    # "jit", or over the devices of all processes "pmap" or "shard_map"
+    parallel: str = "jit"
+    # MiB of scenes up to which the training split is loaded whole
+    in_memory_mb: float = 1024.0
+    # batches read ahead of the step
+    prefetch: int = 4
+    # steps between checkpoints, besides those at the end of each epoch (0: none)
+    checkpoint_every: int = 0
+    # of `rcirl_jax.train.trackers`; None: TensorBoard if it is installed
+    trackers: tuple[str, ...] | None = None
+    # called with the number of each finished step
+    on_step: Callable[[int], None] = lambda step: None
+
+    def __post_init__(self) -> None:
+        """Reject values out of range with the flag's name."""
+        least = {"in_memory_mb": 0, "prefetch": 1, "checkpoint_every": 0}
+        for name, low in least.items():
+            value = getattr(self, name)
+            if not value >= low:
+                raise InputError(f"{name}: {value}: expected >= {low}")
 
 
-def host_batch(
-    demonstrations: Demonstration, weight: np.ndarray, index: np.ndarray
-) -> Batch:
-    """Numpy rows -> a Batch of numpy arrays of the step's types."""
-    weight, index = np.asarray(weight, np.float32), np.asarray(index, np.int32)
-    return Batch(
-        demonstrations=demonstrations,
-        weight=cast(jax.Array, weight),
-        index=cast(jax.Array, index),
-    )
-
-
-def fit_normaliser_on(
-    dataset: Demonstrations, config: TrainConfig, features: FeatureMap
-) -> Normaliser:
-    """The frozen normaliser from `normaliser_rows`."""
-    return fit_normaliser(normaliser_rows(dataset, config), features)
-
-
-def normaliser_rows(dataset: Demonstrations, config: TrainConfig) -> np.ndarray:
-    """[n, F] features of humans and feasible candidates of some training scenes."""
-    index = dataset.indices("train")
-    count = index.size
-    chosen = np.random.default_rng([config.seed, NORMALISER_STREAM]).permutation(count)
-    chosen = np.sort(chosen[:NORMALISER_SCENES])
-    rows = dataset.read(index[chosen])
-    key = jax.random.fold_in(jax.random.key(config.seed), NORMALISER_STREAM)
-    parts = map(rows_that_count, in_chunks(key, rows, chosen, config, index[chosen]))
-    return np.concatenate(list(parts))
-
-
-def in_chunks(
-    key: jax.Array,
-    rows: Demonstration,
-    index: np.ndarray,
-    config: TrainConfig,
-    stored: np.ndarray | None = None,
-) -> Iterator[FeatureBatch]:
-    """Features (numpy) of S scenes, CHUNK at a time; each scene once.
-
-    Args:
-      key: of the candidates, with the numbers of `index`.
-      rows: S demonstrations (numpy).
-      index: [S] number of each scene.
-      config: sampler, positive, features.
-      stored: [S] dataset row of each scene, where that is not `index`.
+def check_run(workdir: Path, config: TrainConfig, dataset: Demonstrations) -> None:
+    """Check that an existing run.json says the same.
 
     Raises:
-      InputError: a stored number or a feature is NaN or infinite (names the scene).
+      InputError: the folder holds a run with other settings (names the first).
     """
-    stored = index if stored is None else stored
-    check_finite("train", rows, stored)
-    for start in range(0, index.size, CHUNK):
-        # the last chunk is filled up: one shape to compile
-        at = np.minimum(np.arange(start, start + CHUNK), index.size - 1)
-        taken = jax.tree.map(lambda x, at=at: x[at], rows)
-        made = featurised(
-            key, to_device_batch(taken, np.ones(CHUNK), index[at]), config
-        )
-        keep = min(CHUNK, index.size - start)
-        made = jax.tree.map(lambda x, n=keep: np.asarray(x[:n]), made)
-        check_features(made, taken, stored[at], config.features)
-        yield made
+    path = workdir / "run.json"
+    if not path.exists():
+        return
+    found = read_json(path, "the file of a training run")
+    try:
+        made = dict(found["config"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: {type(error).__name__}: {error}: expected the file of a training "
+            "run"
+        ) from error
+    described = _described(config, dataset)
+    if found.get("dataset_hash") != described["dataset_hash"]:
+        raise InputError(f"{path}: dataset_hash: made from another dataset")
+    for name in made.keys() - described["config"].keys():
+        raise InputError(f"{path}: {name}: unknown: expected a run of this version")
+    for name, setting in described["config"].items():
+        if made.get(name) != setting and name != "epochs":
+            raise InputError(
+                f"{path}: {name}: {made.get(name)}: expected {setting} to resume; "
+                "use another folder for other settings"
+            )
 
 
-def rows_that_count(batch: FeatureBatch) -> np.ndarray:
-    """[n, F] features at valid times of humans and feasible candidates."""
-    valid = np.asarray(batch.time_valid)
-    human = np.asarray(batch.human)[valid]
-    both = np.asarray(batch.feasible)[:, :, None] & valid[:, None, :]
-    return np.concatenate([human, np.asarray(batch.points)[both]])
+def describe_run(
+    workdir: Path, config: TrainConfig, dataset: Demonstrations, provenance: dict
+) -> None:
+    """Write run.json (process 0)."""
+    if is_first():
+        text = json.dumps({**_described(config, dataset), **provenance}, indent=2)
+        write_whole(workdir / "run.json", text + "\n")
+
+
+def _described(config: TrainConfig, dataset: Demonstrations) -> dict:
+    return {
+        "config": json.loads(json.dumps(dataclasses.asdict(config))),
+        "dataset_hash": dataset.hash,
+    }
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -200,15 +198,15 @@ def _train(
     for line in checkpoints.passed_over if is_first() else ():
         print(line, file=sys.stderr)
     if checkpoints.latest_step() is None:
-        made = init_state(config, fit_normaliser_on(dataset, config, features))
-        state = parallel.replicate(made)
+        rows = normaliser_rows(dataset, config)
+        state = parallel.replicate(init_state(config, fit_normaliser(rows, features)))
     else:
-        like = parallel.replicate(_like(config, features))
+        like = parallel.replicate(blank_state(config))
         state, position = checkpoints.restore(like)
         batches.restore(position)
     describe_run(workdir, config, dataset, provenance)
     per_epoch = batches.batches_per_epoch
-    run = _Run(config, running, features, per_epoch, workdir, state, dataset)
+    run = _Run(config, running, per_epoch, workdir, state, dataset)
 
     def produce() -> tuple:
         """The next batch, on its devices before its step, and where it stands."""
@@ -216,7 +214,8 @@ def _train(
             raise StopIteration
         rows, weight, index = next(batches)
         weight = weight * dataset.weights(index)
-        return parallel.place(host_batch(rows, weight, index)), batches.state()
+        placed = parallel.place(host_batch(rows, weight, index))
+        return placed, index[weight > 0.0], batches.state()
 
     # a signal waits for the end of the step, and for what is being saved
     with (
@@ -247,15 +246,56 @@ def restore_run(workdir: Path, config: TrainConfig) -> TrainState:
             raise InputError(f"{line}: expected whole; run the training again")
         if checkpoints.latest_step() is None:
             raise InputError(f"{workdir}: checkpoints: none: expected a trained run")
-        return checkpoints.restore(_like(config, feature_map(config.features)))[0]
+        return checkpoints.restore(blank_state(config))[0]
     finally:
         checkpoints.close()
 
 
-def _like(config: TrainConfig, features: FeatureMap) -> TrainState:
-    ones = jnp.ones(features.num_features)
+def blank_state(config: TrainConfig) -> TrainState:
+    """Returns a state of a run's structure, to restore a checkpoint into."""
+    ones = jnp.ones(feature_map(config.features).num_features)
     return init_state(
         config, Normaliser(lower=ones, upper=ones, location=ones, scale=ones)
+    )
+
+
+def refuse_step(
+    state: TrainState,
+    step: int,
+    index: np.ndarray,
+    dataset: Demonstrations,
+    config: TrainConfig,
+) -> None:
+    """Names what made a step not finite: makes its features again and looks at them.
+
+    Args:
+      state: before or after the step.
+      step: its number, from 1.
+      index: dataset rows of its scenes, in this process.
+      dataset: where they lie.
+      config: of the training.
+
+    Raises:
+      InputError: always.
+    """
+    if jax.process_count() > 1:
+        index = np.ravel(multihost_utils.process_allgather(index))
+    rows, key = dataset.read(index), jax.random.fold_in(state.key, step - 1)
+    batch = jax.device_put(host_batch(rows, np.ones(index.size), index))
+    found = not_finite(featurised(key, batch, config), config.features)
+    bad = np.array(list(found.values()))
+    if not bad.any():
+        raise InputError(
+            f"train: step {step}: loss or gradient: not finite: features are finite; "
+            "lower learning_rate; the state before is kept"
+        )
+    at = int(np.argmax(bad.any(axis=0)))
+    names = ", ".join(name for name, of in found.items() if of[at])
+    leaves = unusable_leaves(rows, at)
+    cause = f" (as is the stored {', '.join(leaves)})" if leaves else ""
+    raise InputError(
+        f"train: step {step}: {scene_name(rows, at, int(index[at]))}: {names}: not "
+        f"finite{cause}: expected finite numbers; the state before is kept"
     )
 
 
@@ -266,13 +306,12 @@ class _Run:
         self,
         config: TrainConfig,
         running: Running,
-        features: FeatureMap,
         per_epoch: int,
         workdir: Path,
         state: TrainState,
         dataset: Demonstrations,
     ) -> None:
-        self.config, self.running, self.features = config, running, features
+        self.config, self.running = config, running
         self.dataset = dataset
         self.per_epoch, first_step = per_epoch, int(state.step)
         total = self.per_epoch * config.epochs
@@ -304,11 +343,13 @@ class _Run:
         for epoch in range(step // self.per_epoch, self.config.epochs):
             sums = np.zeros(4)
             for _ in range(self.per_epoch - step % self.per_epoch):
-                batch, position = next(batches)
+                batch, index, position = next(batches)
                 step += 1
-                with with_the_others(step):
+                with exit_if_peer_lost(step):
                     state, metrics = take_step(state, batch)
                     metrics = jax.device_get(metrics)
+                if not metrics.finite:
+                    refuse_step(state, step, index, self.dataset, self.config)
                 sums += self._after_step(step, metrics)
                 stop = self._told_to_stop(step)
                 if stop or self._is_due(step):
@@ -322,9 +363,9 @@ class _Run:
 
     def _draw_time_weights(self, step: int, state: TrainState) -> None:
         """Gamma over time, for the trackers."""
-        if self.trackers and isinstance(state.params, RewardParams):
-            gamma = np.asarray(pinned(state.params, self.config.reward).gamma)
-            if (figure := time_weights(gamma)) is not None:
+        if self.trackers:
+            gamma = effective_params(state.params, self.config.reward)["gamma"]
+            if (figure := time_weights(np.asarray(gamma))) is not None:
                 for tracker in self.trackers:
                     tracker.figure(step, "time weights", figure)
 
@@ -339,7 +380,6 @@ class _Run:
         return step % self.per_epoch == 0 or (every > 0 and step % every == 0)
 
     def _after_step(self, step: int, metrics: StepMetrics) -> np.ndarray:
-        check_step(metrics, self.features, step, self.dataset)
         pairs = max(float(metrics.pairs), 1.0)
         shown = {
             "loss": float(metrics.loss_sum) / max(float(metrics.terms), 1.0),

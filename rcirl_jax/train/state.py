@@ -1,21 +1,25 @@
 """What training carries: state, batch, configuration."""
 
 import dataclasses
+import functools
 import inspect
 from collections.abc import Callable
+from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from flax.training import train_state
+from jax.typing import ArrayLike
 
 from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.reward import (
     LOSSES,
+    CandidateInfo,
     LossConfig,
     Normaliser,
-    Parameters,
     RewardConfig,
     RewardParams,
 )
@@ -50,6 +54,7 @@ PAPER_OPTIMIZERS: dict[str, Optimizer] = {
 }
 OPTIMIZERS = PAPER_OPTIMIZERS | (_of_optax() | PAPER_OPTIMIZERS)
 
+NEVER = 2**31 - 1  # refused updates in a row after which one is taken all the same
 POSITIVES = ("human", "nearest")
 # what the learner sees of the others' future: the planner's prediction, or the record
 FUTURES = ("predicted", "recorded")
@@ -172,46 +177,46 @@ class TrainConfig:
         return dataclasses.replace(self, seed=0, epochs=1)
 
     @property
-    def loss_config(self) -> LossConfig:
-        """Constants of the losses."""
+    def for_members(self) -> "TrainConfig":
+        """What the members of a sweep share (`train.sweep`)."""
+        return dataclasses.replace(self, learning_rate=0.5, leaky_rate=0.5, seed=0)
+
+    def loss_config(self, leaky_rate: ArrayLike | None = None) -> LossConfig:
+        """Constants of the losses; a `leaky_rate` that is given may be traced."""
         names = [field.name for field in dataclasses.fields(LossConfig)]
-        return LossConfig(**{name: getattr(self, name) for name in names})
+        made = LossConfig(**{name: getattr(self, name) for name in names})
+        if leaky_rate is None:
+            return made
+        return dataclasses.replace(made, leaky_rate=leaky_rate)
 
 
-class TrainState(flax.struct.PyTreeNode, kw_only=True):
-    """All that a step changes or needs besides its batch; what a checkpoint holds.
+class TrainState(train_state.TrainState):
+    """Flax's TrainState (step, params, opt_state, apply_fn, tx) and two more.
 
-    Flax's own TrainState would carry `apply` and the optimiser too: here the
-    configuration makes them (`make_train_step`).
+    `params` are raw (see `reward.network.effective_params`). A checkpoint holds the
+    arrays; `apply_fn` and `tx` are static and come from the configuration.
     """
 
-    step: jax.Array  # [] int32, steps taken, refused ones included
-    params: Parameters  # raw: pin and constraints are applied where they are used
-    opt_state: optax.OptState  # of `make_optimizer`
     key: jax.Array  # typed PRNG key; folded with step and row, never split away
     normaliser: Normaliser  # frozen
 
 
-class Facts(flax.struct.PyTreeNode, kw_only=True):
-    """What losses know about the trajectories besides their values."""
+class Batch(flax.struct.PyTreeNode, kw_only=True):
+    """Scenes of one step; candidates and features are made on the device."""
 
-    human_distance: jax.Array  # [B] m, the positive's mean distance to the human
-    human_collides: jax.Array  # [B] bool, of the positive; a recorded curve's is False
-    distance: jax.Array  # [B, K] m, the candidates'
-    collides: jax.Array  # [B, K] bool, meets a body at a valid time
-    breaks_rule: jax.Array  # [B, K] share of times over the limit; 1: ran a line
-    human_density: jax.Array  # [B] log of the proposal's density
-    density: jax.Array  # [B, K]
+    demonstrations: Demonstration  # [B, ...]
+    weight: jax.Array  # [B] 1, or 0 for padding
+    index: jax.Array  # [B] int32, row in the dataset; seeds the sampler
 
 
 class FeatureBatch(flax.struct.PyTreeNode, kw_only=True):
-    """The same with features already made (a feature cache)."""
+    """The same with features already made."""
 
     human: jax.Array  # [B, T, F] of the positive
     candidates: jax.Array  # [B, F, T, K]: points run along the long axes
     feasible: jax.Array  # [B, K] bool
     time_valid: jax.Array  # [B, T] bool
-    facts: Facts
+    info: CandidateInfo
     weight: jax.Array  # [B]
     index: jax.Array  # [B] int32
 
@@ -227,42 +232,33 @@ class FeatureBatch(flax.struct.PyTreeNode, kw_only=True):
         return jnp.broadcast_to(self.time_valid[:, None], shape)
 
 
-class Batch(flax.struct.PyTreeNode, kw_only=True):
-    """Scenes of one step; candidates and features are made on the device."""
-
-    demonstrations: Demonstration  # [B, ...]
-    weight: jax.Array  # [B] 1, or 0 for padding
-    index: jax.Array  # [B] int32, row in the dataset; seeds the sampler
-
-
-def weight_decay(config: TrainConfig) -> optax.GradientTransformation:
-    """The pull on kernels and biases; time weights, context and prior stay free."""
-    if config.weight_decay == 0.0:
-        return optax.identity()
-
-    def pulled(params: Parameters) -> Parameters:
-        free = jax.tree.map(lambda _: False, params)
-        if not isinstance(params, RewardParams):
-            return {**free, "point": jax.tree.map(lambda _: True, params["point"])}
-        yes = jax.tree.map(lambda _: True, (params.kernels, params.biases))
-        return free.replace(kernels=yes[0], biases=yes[1])
-
-    return optax.add_decayed_weights(config.weight_decay, mask=pulled)
-
-
-def make_rule(
-    config: TrainConfig, rate: optax.ScalarOrSchedule
-) -> optax.GradientTransformation:
-    """The optimiser with a step size, after clipping and weight decay as configured."""
-    parts = [weight_decay(config), OPTIMIZERS[config.optimizer](rate)]
-    if config.clip_norm:
-        parts.insert(0, optax.clip_by_global_norm(config.clip_norm))
-    return optax.chain(*parts)
-
-
+@functools.lru_cache(maxsize=16)
 def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:
-    """The optimiser named in the configuration, its step size halved as asked."""
-    rate: optax.ScalarOrSchedule = config.learning_rate
+    """The optimiser of a configuration, after clipping and weight decay as configured.
+
+    Its learning rate is an array of its state, so that the members of a sweep can
+    differ in it. An update that is not finite is left out.
+    """
+
+    def rule(
+        learning_rate: jax.Array, halved: ArrayLike = 1.0
+    ) -> optax.GradientTransformation:
+        parts = [OPTIMIZERS[config.optimizer](learning_rate * halved)]
+        if config.weight_decay:
+            parts.insert(0, optax.add_decayed_weights(config.weight_decay, _of_layers))
+        if config.clip_norm:
+            parts.insert(0, optax.clip_by_global_norm(config.clip_norm))
+        return optax.chain(*parts)
+
+    given: dict[str, Any] = {"learning_rate": config.learning_rate}
     if config.halve_every:
-        rate = optax.exponential_decay(rate, config.halve_every, 0.5)
-    return make_rule(config, rate)
+        given["halved"] = optax.exponential_decay(1.0, config.halve_every, 0.5)
+    return optax.apply_if_finite(optax.inject_hyperparams(rule)(**given), NEVER)
+
+
+def _of_layers(params: RewardParams) -> RewardParams:
+    """Mask of weight decay: kernels and biases; gamma, gates and offset are free."""
+    return {
+        name: jax.tree.map(lambda _, name=name: name == "point", leaf)
+        for name, leaf in params.items()
+    }

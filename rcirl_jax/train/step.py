@@ -1,34 +1,32 @@
-"""The training step: pure, written once for jit, pmap and shard_map.
+"""The training step on one page: pure, the same under jit, pmap and shard_map.
 
-Shards carry (sum, count) and divide once after `psum`: a mean of shard means
-is wrong when shards hold different numbers of pairs.
+scene -> candidates -> features -> V of the human and of the candidates (Siamese) ->
+loss -> gradient -> optimiser. Shards carry (sum, count) and divide once after `psum`:
+a mean of shard means is wrong when shards hold different numbers of pairs.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
+from jax.typing import ArrayLike
 
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import (
-    Compared,
-    LossConfig,
+    LossInputs,
     LossSums,
-    RewardConfig,
-    init_reward,
-    init_tree,
+    Normaliser,
+    RewardModel,
+    RewardParams,
+    init_params,
     loss_sums,
-    pinned,
-    scenes_value,
-    value,
 )
+from rcirl_jax.reward.network import matmul_f32
 from rcirl_jax.sampling import num_candidates
 from rcirl_jax.train.featurise import featurise
-from rcirl_jax.train.finite import bad_facts, bad_values, count_bad
-from rcirl_jax.train.pieces import Scenes, added_and_kept, block_size, in_pieces
 from rcirl_jax.train.state import (
     Batch,
     FeatureBatch,
@@ -36,7 +34,11 @@ from rcirl_jax.train.state import (
     TrainState,
     make_optimizer,
 )
-from rcirl_jax.types import Normaliser, Parameters, RewardParams
+
+Scenes = TypeVar("Scenes", Batch, FeatureBatch)
+Apply = Callable[..., jax.Array]  # of a `RewardModel`
+TRAJECTORIES = 1 << 11  # made together on a CPU
+TINY = 1e-30  # so small a weight that a sum of finite numbers does not overflow
 
 
 class StepMetrics(flax.struct.PyTreeNode, kw_only=True):
@@ -47,72 +49,167 @@ class StepMetrics(flax.struct.PyTreeNode, kw_only=True):
     wins: jax.Array  # [] pairs the human wins, ties half
     pairs: jax.Array  # [] feasible pairs (queries)
     grad_norm: jax.Array  # []
-    # [F + 1] scenes with values that are NaN or infinite, per feature; last: facts
-    nonfinite: jax.Array
-    first_bad: jax.Array  # [] dataset row of a scene with such a value, or -1
-    finite: jax.Array  # [] bool: loss and gradient are finite
+    finite: jax.Array  # [] bool: features, loss and gradient are; else nothing changed
 
 
-def siamese_values(
-    params: Parameters,
-    normaliser: Normaliser,
-    batch: FeatureBatch,
-    reward: RewardConfig,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """(V of the positives [B], of the candidates [B, K], the prior's logit []).
-
-    In the fast layout for the package's own network, by `value` for any other.
-    """
-    if not isinstance(params, RewardParams):
-        human = value(params, normaliser, batch.human, batch.time_valid, reward)
-        others = value(params, normaliser, batch.points, batch.points_valid, reward)
-        return human, others, params.get("offset", jnp.zeros(()))
-    both = (batch.human.swapaxes(1, 2)[..., None], batch.candidates)
-    activation = reward.hidden_activation
-    human, candidates = scenes_value(
-        pinned(params, reward), normaliser, both, batch.time_valid, activation
+def init_state(
+    config: TrainConfig, normaliser: Normaliser, seed: ArrayLike | None = None
+) -> TrainState:
+    """A fresh state; everything random comes from `seed`, by default the config's."""
+    init_key, train_key = jax.random.split(
+        jax.random.key(config.seed if seed is None else seed)
     )
-    offset = jnp.zeros(()) if params.offset is None else params.offset
-    return human[:, 0], candidates, offset
+    count = feature_map(config.features).num_features
+    params = init_params(init_key, count, config.reward)
+    if config.loss == "gan":
+        params["offset"] = jnp.zeros(())
+    made = TrainState.create(
+        apply_fn=RewardModel(config.reward).apply,
+        params=params,
+        tx=make_optimizer(config.for_step),
+        key=train_key,
+        normaliser=normaliser,
+    )
+    return made.replace(step=jnp.zeros((), jnp.int32))
 
 
-def compare(
-    params: Parameters,
+def make_train_step(
+    config: TrainConfig,
+) -> Callable[..., tuple[TrainState, StepMetrics]]:
+    """Returns `train_step(state, batch, *, leaky_rate=None, axis_name=None)`.
+
+    `batch` is a Batch (candidates and features are made in the step) or a FeatureBatch.
+    `leaky_rate` replaces the configuration's and may be traced. With `axis_name` the
+    step runs inside pmap or shard_map and sums over that axis. The step returns (state,
+    StepMetrics); one that is not finite leaves parameters and optimiser as they were.
+    """
+
+    def train_step(
+        state: TrainState,
+        batch: Batch | FeatureBatch,
+        *,
+        leaky_rate: ArrayLike | None = None,
+        axis_name: str | None = None,
+    ) -> tuple[TrainState, StepMetrics]:
+        grads, sums, unusable = batch_sums(state, batch, config, leaky_rate)
+        if axis_name is not None:
+            grads, sums, unusable = jax.lax.psum((grads, sums, unusable), axis_name)
+        grads = jax.tree.map(lambda g: g / jnp.maximum(sums.terms, 1.0), grads)
+        norm = optax.tree.norm(grads)
+        finite = jnp.isfinite(sums.loss) & jnp.isfinite(norm) & (unusable == 0)
+        # the optimiser leaves out updates that are not finite (`make_optimizer`)
+        grads = jax.tree.map(lambda g: jnp.where(finite, g, jnp.nan), grads)
+        metrics = StepMetrics(
+            loss_sum=sums.loss,
+            terms=sums.terms,
+            wins=sums.wins,
+            pairs=sums.pairs,
+            grad_norm=norm,
+            finite=finite,
+        )
+        return state.apply_gradients(grads=grads), metrics
+
+    return train_step
+
+
+def batch_sums(
+    state: TrainState,
+    batch: Batch | FeatureBatch,
+    config: TrainConfig,
+    leaky_rate: ArrayLike | None = None,
+) -> tuple[RewardParams, LossSums, jax.Array]:
+    """Returns (gradient of the loss sum, sums, number of scenes that are not finite).
+
+    On a CPU the network takes one scene at a time: its features (0.2 MB for 122
+    candidates) and hidden units stay in a core's cache from the forward to the backward
+    pass. Candidates and features are made for a block of scenes before that, whose
+    features (3 MB) stay in its caches too; all at once takes twice as long. Elsewhere
+    the whole batch is one microbatch.
+    """
+    on_cpu = jax.default_backend() == "cpu"
+
+    def learn(part: FeatureBatch) -> tuple:
+        grads, sums = gradient_sums(
+            state.apply_fn, state.params, state.normaliser, part, config, leaky_rate
+        )
+        return grads, sums, unusable_scenes(part)
+
+    def learn_from(part: FeatureBatch) -> tuple:
+        return scan_sum(learn, part, 1 if on_cpu else part.weight.shape[0])
+
+    if isinstance(batch, FeatureBatch):
+        return learn_from(batch)
+    key = jax.random.fold_in(state.key, state.step)
+    features, scenes = feature_map(config.features), batch.weight.shape[0]
+    most = TRAJECTORIES // (num_candidates(config.sampler) + config.hard_drawn)
+    block = _divisor(scenes, most) if on_cpu else scenes
+    make = lambda part: featurise(key, part, config, features)  # noqa: E731
+    return scan_sum(lambda part: learn_from(make(part)), batch, block)
+
+
+def gradient_sums(
+    apply: Apply,
+    params: RewardParams,
     normaliser: Normaliser,
     batch: FeatureBatch,
-    reward: RewardConfig,
-) -> Compared:
-    """Values of a batch under the Siamese network, with what losses need beside."""
-    facts = batch.facts
-    human, candidates, offset = siamese_values(params, normaliser, batch, reward)
-    return Compared(
+    config: TrainConfig,
+    leaky_rate: ArrayLike | None = None,
+) -> tuple[RewardParams, LossSums]:
+    """Returns the gradient of the loss sum, and the sums; divide by `terms` later."""
+    if config.hard_negatives and config.hard_pool > 1:
+        batch = keep_hardest_negatives(apply, params, normaliser, batch, config)
+    constants = config.loss_config(leaky_rate)
+
+    def total(params: RewardParams) -> tuple[jax.Array, LossSums]:
+        inputs = loss_inputs(apply, params, normaliser, batch)
+        sums = loss_sums(config.loss, inputs, constants)
+        return sums.loss, sums
+
+    return jax.grad(total, has_aux=True)(params)
+
+
+def loss_inputs(
+    apply: Apply, params: RewardParams, normaliser: Normaliser, batch: FeatureBatch
+) -> LossInputs:
+    """Returns V of humans and candidates, with what losses read beside it."""
+
+    def siamese(
+        human: jax.Array, candidates: jax.Array, valid: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """V of the human [T, F] and of K candidates [F, T, K] of one scene."""
+        pair = human.T[:, :, None], candidates
+        of_human, of_candidates = apply({"params": params}, normaliser, valid, *pair)
+        return of_human[0], of_candidates
+
+    scenes = batch.human, batch.candidates, batch.time_valid
+    if batch.weight.shape[0] == 1:  # plain matrix products, which a CPU is faster at
+        found = siamese(*(x[0] for x in scenes))
+        human, candidates = jax.tree.map(lambda x: x[None], found)
+    else:
+        human, candidates = jax.vmap(siamese)(*scenes)
+    return LossInputs(
         human=human,
         candidates=candidates,
-        counts=batch.feasible,
+        feasible=batch.feasible,
         weight=batch.weight,
-        human_distance=facts.human_distance,
-        human_collides=facts.human_collides,
-        distance=facts.distance,
-        collides=facts.collides,
-        breaks_rule=facts.breaks_rule,
-        human_density=facts.human_density,
-        density=facts.density,
-        offset=offset,
+        info=batch.info,
+        offset=params.get("offset", jnp.zeros(())),
     )
 
 
-def mined(
-    params: Parameters,
+def keep_hardest_negatives(
+    apply: Apply,
+    params: RewardParams,
     normaliser: Normaliser,
     batch: FeatureBatch,
     config: TrainConfig,
 ) -> FeatureBatch:
-    """Of the hard negatives drawn, only those the present reward values most.
+    """Of the hard negatives drawn, keeps those the present reward values most.
 
     The pool stands last among the candidates; the others stop counting.
     """
     pool = config.hard_drawn
-    values = compare(params, normaliser, batch, config.reward).candidates[:, -pool:]
+    values = loss_inputs(apply, params, normaliser, batch).candidates[:, -pool:]
     feasible = batch.feasible[:, -pool:]
     values = jnp.where(feasible, values, -jnp.inf)
     least = jax.lax.top_k(values, config.hard_negatives)[0][:, -1:]
@@ -122,139 +219,46 @@ def mined(
     )
 
 
-def gradient_sums(
-    params: Parameters,
-    normaliser: Normaliser,
-    batch: FeatureBatch,
-    config: TrainConfig,
-    constants: LossConfig | None = None,
-) -> tuple[Parameters, LossSums]:
-    """Gradient of the loss sum, and the sums; divide by `terms` afterwards.
+def unusable_scenes(batch: FeatureBatch) -> jax.Array:
+    """Counts scenes of weight > 0 with a feature or fact that is not finite.
 
-    `constants` replaces those of the configuration and may hold tracers.
+    Clipping hides an infinite feature from the loss. A weighted sum sees it, at the
+    speed of the memory.
     """
-    if config.hard_negatives and config.hard_pool > 1:
-        batch = mined(params, normaliser, batch, config)
 
-    def total(params: Parameters) -> tuple[jax.Array, LossSums]:
-        compared = compare(params, normaliser, batch, config.reward)
-        sums = loss_sums(config.loss, compared, constants or config.loss_config)
-        return sums.loss, sums
+    def holds_bad(x: jax.Array) -> jax.Array:
+        flat = x.reshape(*x.shape[:2], -1)
+        sums = matmul_f32(flat, jnp.full((flat.shape[2],), TINY))
+        return jnp.any(~jnp.isfinite(sums), axis=1)
 
-    return jax.grad(total, has_aux=True)(params)
-
-
-def _by_pieces(
-    work: Callable[[Scenes], tuple], batch: Scenes, size: int | None = None
-) -> tuple:
-    """`work(batch)` piece by piece: (sums, rows of the batch)."""
-    numbers, piece = in_pieces(batch, size)
-    sums, rows = added_and_kept(lambda number: work(piece(number)), numbers)
-    return sums, rows.reshape(-1, rows.shape[-1])
+    info = batch.info
+    of_human = info.human_distance + info.human_density
+    of_each = info.distance + info.breaks_rule + info.density
+    bad = holds_bad(batch.candidates) | holds_bad(batch.human) | ~jnp.isfinite(of_human)
+    bad |= jnp.any(~jnp.isfinite(of_each) & batch.feasible, axis=-1)
+    return jnp.sum(bad & (batch.weight > 0.0))
 
 
-def as_tree(params: Parameters) -> Any:  # noqa: ANN401
-    """The same object under optax's type for parameter trees."""
-    return params
+def scan_sum(work: Callable[[Scenes], Any], batch: Scenes, size: int) -> Any:  # noqa: ANN401
+    """Sums `work(microbatch)` over microbatches of `size` scenes by a `lax.scan`.
 
-
-def batch_sums(
-    state: TrainState, batch: Batch | FeatureBatch, config: TrainConfig
-) -> tuple[tuple[Parameters, LossSums], jax.Array]:
-    """((gradient of the loss sum, sums), scenes with bad values [B, F + 1]) of a batch.
-
-    The last column is of the facts that losses read besides features.
-
-    Of a Batch, candidates and features are made block by block (`block_size`), and
-    the network reads them while they are in the cache; values are checked there too.
+    A microbatch is cut out where it is used: leaves reshaped to [n, size, ...] would be
+    copied whole before the loop.
     """
-    key = jax.random.fold_in(state.key, state.step)
-    features = feature_map(config.features)
+    scenes = batch.weight.shape[0]
+    if size == scenes:
+        return work(batch)
 
-    def learn(part: FeatureBatch) -> tuple:
-        found = gradient_sums(state.params, state.normaliser, part, config)
-        return found, jnp.concatenate([bad_values(part), bad_facts(part)], axis=1)
+    def cut(start: ArrayLike) -> Scenes:
+        part = lambda x: jax.lax.dynamic_slice_in_dim(x, start, size)  # noqa: E731
+        return jax.tree.map(part, batch)
 
-    def learn_from(part: Batch) -> tuple:
-        return _by_pieces(learn, featurise(key, part, config, features))
-
-    if isinstance(batch, FeatureBatch):
-        return _by_pieces(learn, batch)
-    candidates = num_candidates(config.sampler) + config.hard_drawn
-    size = block_size(batch.weight.shape[0], candidates)
-    return _by_pieces(learn_from, batch, size)
+    like = jax.eval_shape(lambda: work(cut(0)))
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    add = lambda total, start: (jax.tree.map(jnp.add, total, work(cut(start))), None)  # noqa: E731
+    return jax.lax.scan(add, zeros, jnp.arange(0, scenes, size))[0]
 
 
-def make_train_step(
-    config: TrainConfig,
-) -> Callable[..., tuple[TrainState, StepMetrics]]:
-    """`train_step(state, batch, *, axis_name=None) -> (state, metrics)`.
-
-    `batch` is a Batch (everything is made on the device) or a FeatureBatch.
-    With `axis_name` the step runs inside pmap or shard_map and sums over that
-    axis. A step whose loss or gradient is not finite leaves the state as it was and
-    says so in the metrics; not by `optax.apply_if_finite`, which sees updates only: it
-    cannot name scene and feature.
-    """
-    optimizer = make_optimizer(config)
-
-    def train_step(
-        state: TrainState, batch: Batch | FeatureBatch, *, axis_name: str | None = None
-    ) -> tuple[TrainState, StepMetrics]:
-        (grads, sums), bad = batch_sums(state, batch, config)
-        nonfinite, first_bad = count_bad(bad, batch.index)
-        if axis_name is not None:
-            sums, grads, nonfinite = jax.lax.psum((sums, grads, nonfinite), axis_name)
-            first_bad = jax.lax.pmax(first_bad, axis_name)
-        grads = jax.tree.map(lambda g: g / jnp.maximum(sums.terms, 1.0), grads)
-        norm = optax.tree.norm(grads)
-        finite = jnp.isfinite(sums.loss) & jnp.isfinite(norm)
-        before = as_tree(state.params)
-        updates, opt_state = optimizer.update(grads, state.opt_state, before)
-        params = optax.apply_updates(before, updates)
-        keep = lambda new, old: jnp.where(finite, new, old)  # noqa: E731
-        new_state = TrainState(
-            step=state.step + 1,
-            params=jax.tree.map(keep, params, state.params),
-            opt_state=jax.tree.map(keep, opt_state, state.opt_state),
-            key=state.key,
-            normaliser=state.normaliser,
-        )
-        metrics = StepMetrics(
-            loss_sum=sums.loss,
-            terms=sums.terms,
-            wins=sums.wins,
-            pairs=sums.pairs,
-            grad_norm=norm,
-            nonfinite=nonfinite,
-            first_bad=first_bad,
-            finite=finite & (first_bad < 0),
-        )
-        return new_state, metrics
-
-    return train_step
-
-
-def init_params(key: jax.Array, num_features: int, config: TrainConfig) -> Parameters:
-    """Random parameters, with the discriminator's offset for the GAN loss."""
-    if config.reward.module:
-        tree = init_tree(key, num_features, config.reward)
-        return {**tree, "offset": jnp.zeros(())} if config.loss == "gan" else tree
-    params = init_reward(key, num_features, config.reward)
-    if config.loss == "gan":
-        params = params.replace(offset=jnp.zeros(()))
-    return params
-
-
-def init_state(config: TrainConfig, normaliser: Normaliser) -> TrainState:
-    """A fresh state; everything random comes from `config.seed`."""
-    features = feature_map(config.features)
-    init_key, train_key = jax.random.split(jax.random.key(config.seed))
-    params = init_params(init_key, features.num_features, config)
-    return TrainState(
-        step=jnp.zeros((), jnp.int32),
-        params=params,
-        opt_state=make_optimizer(config).init(as_tree(params)),
-        key=train_key,
-        normaliser=normaliser,
-    )
+def _divisor(size: int, most: int) -> int:
+    """The largest divisor of `size` that is not above `most`, at least 1."""
+    return next((n for n in range(min(size, most), 1, -1) if size % n == 0), 1)

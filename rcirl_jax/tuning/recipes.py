@@ -23,7 +23,7 @@ from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.store.joined import EQUAL
 from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.evaluation.gate.types import GateConfig
-from rcirl_jax.export.sweep.result import read_sweep
+from rcirl_jax.export.sweep import read_sweep
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.runtime.checked import check_names, typed_fields, typed_settings

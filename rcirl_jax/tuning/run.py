@@ -30,7 +30,7 @@ from rcirl_jax.export.reader import Reward
 from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.runtime.pipeline import Stages, code_sha256, file_sha256
 from rcirl_jax.simulation.rows import BASELINES
-from rcirl_jax.train.running import Running
+from rcirl_jax.train.loop import Running
 from rcirl_jax.tuning.recipes import TuneConfig
 
 # what reads as permission to use weights that are no longer there

@@ -33,8 +33,7 @@ from rcirl_jax.export.closed_loop import SuiteJob, read_tuned_idm, write_tuned_i
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
 from rcirl_jax.export.loading import open_reward, scorer_of
-from rcirl_jax.export.sweep.folder import SWEEP
-from rcirl_jax.export.sweep.result import read_sweep
+from rcirl_jax.export.sweep import SWEEP, read_sweep
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW
 from rcirl_jax.report.replays import Replay, make_replays
 from rcirl_jax.runtime.atomic_files import read_json, write_json, write_whole

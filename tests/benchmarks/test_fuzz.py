@@ -15,8 +15,7 @@ from benchmarks.reliability.fuzz import changes
 from benchmarks.reliability.fuzz.contract import breach, watched
 from benchmarks.reliability.fuzz.readers import READERS, inputs
 from rcirl_jax.errors import InputError, as_input_error
-from rcirl_jax.export.sweep.folder import SWEEP
-from rcirl_jax.export.sweep.result import read_sweep
+from rcirl_jax.export.sweep import SWEEP, read_sweep
 from rcirl_jax.features import mapping
 from rcirl_jax.report.charts import sweep_picture
 from rcirl_jax.runtime import pipeline

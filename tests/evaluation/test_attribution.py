@@ -9,14 +9,15 @@ import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.attribution import attribute
-from rcirl_jax.reward import Normaliser, RewardConfig, RewardParams, normalise, value
+from rcirl_jax.reward import Normaliser, effective_model, normalise, value
+from rcirl_jax.reward.network import point_of
 from rcirl_jax.units import NUM_TIMES
 
 T, F = NUM_TIMES, 21
 VALID = np.arange(T) < T - 3
 
 run = jax.jit(attribute, static_argnames=("activation", "steps"))
-value_of = jax.jit(value, static_argnames="config")
+value_of = jax.jit(value, static_argnames="model")
 
 
 def floats(x):
@@ -37,20 +38,19 @@ def network(hidden=(15,), seed=0):
     """Random weights of about the size that keeps units out of saturation."""
     rng = np.random.default_rng(seed)
     sizes = (F, *hidden, 1)
-    return RewardParams(
-        gamma=floats(rng.uniform(0.1, 0.4, T)),
-        kernels=tuple(
-            floats(rng.normal(0, i**-0.5, (i, o))) for i, o in itertools.pairwise(sizes)
-        ),
-        biases=tuple(floats(rng.normal(0, 0.3, h)) for h in hidden),
-    )
+    gamma = floats(rng.uniform(0.1, 0.4, T))
+    kernels = [
+        floats(rng.normal(0, i**-0.5, (i, o))) for i, o in itertools.pairwise(sizes)
+    ]
+    biases = [floats(rng.normal(0, 0.3, h)) for h in hidden]
+    return {"gamma": gamma, "point": point_of(kernels, biases)}
 
 
 def difference(params, a, b, activation="tanh"):
     """V(a) - V(b) as the package has it."""
-    config = RewardConfig(hidden=(1,), activation=activation, pin="none")
+    model = effective_model(params, activation)
     both = jnp.stack([a, b])
-    worth = value_of(params, normaliser(), both, jnp.stack([VALID] * 2), config)
+    worth = value_of(model, params, normaliser(), both, jnp.stack([VALID] * 2))
     return float(worth[0] - worth[1])
 
 
@@ -64,8 +64,8 @@ def test_linear_reward_gives_the_terms_of_its_sum():
     params = network(())
     a, b = trajectories()
     x_a, x_b = (np.asarray(normalise(normaliser(), f), np.float64) for f in (a, b))
-    gamma = np.asarray(params.gamma, np.float64)[:, None] * VALID[:, None]
-    want = gamma * np.asarray(params.kernels[0])[:, 0] * (x_a - x_b)
+    gamma = np.asarray(params["gamma"], np.float64)[:, None] * VALID[:, None]
+    want = gamma * np.asarray(params["point"]["out"]["kernel"])[:, 0] * (x_a - x_b)
     got = run(params, normaliser(), a, b, VALID, "identity", steps=1)
     np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)
 

@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from rcirl_jax.features import feature_map
 from rcirl_jax.features.relations import relate, slots
 from rcirl_jax.planner.rank import hand_score, learned_score
-from rcirl_jax.reward import LOSSES, RewardConfig, init_reward, pinned
+from rcirl_jax.reward import LOSSES, RewardConfig, effective_params, init_params
 from rcirl_jax.sampling import SamplerConfig, trajectory_on_path
 from rcirl_jax.train import featurise as making
-from rcirl_jax.train.featurise import featurise
-from rcirl_jax.train.loop import to_device_batch
+from rcirl_jax.train.featurise import featurise, host_batch
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.train.step import gradient_sums, init_state
 from rcirl_jax.types import Candidates, Kind
@@ -56,8 +55,8 @@ REWARD = RewardConfig()
 def weights():
     count = feature_map("paper21").num_features
     with jax.ensure_compile_time_eval():  # asked for inside of traced functions
-        params = init_reward(jax.random.key(1), count, REWARD)
-        return pinned(params, REWARD), normaliser()
+        params = init_params(jax.random.key(1), count, REWARD)
+        return effective_params(params, REWARD), normaliser()
 
 
 def one_of(trajectory):
@@ -139,7 +138,7 @@ def featurised(alike=False, **changes):
     """Features of all scenes; `alike`: every candidate is the human."""
     config = TrainConfig(sampler=SMALL, **changes)
     count = len(SCENES)
-    given = to_device_batch(demonstrations(), np.ones(count), np.arange(count))
+    given = host_batch(demonstrations(), np.ones(count), np.arange(count))
     whole = making.candidates_of
 
     def copies(key, shown, config):
@@ -167,15 +166,17 @@ def batches():
     }
 
 
-take_sums = jax.jit(gradient_sums, static_argnums=3)
+take_sums = jax.jit(gradient_sums, static_argnums=(0, 4))
 
 
 @pytest.mark.parametrize("loss", sorted(LOSSES))
 def test_slopes_by_parameters_are_finite(loss):
     config = TrainConfig(sampler=SMALL, loss=loss)
-    params = init_state(config, normaliser()).params
+    state = init_state(config, normaliser())
     for name, made in batches().items():
-        grads, sums = take_sums(params, normaliser(), made, config)
+        grads, sums = take_sums(
+            state.apply_fn, state.params, normaliser(), made, config
+        )
         assert finite((grads, sums)), name
         most = max(np.abs(x).max() for x in jax.tree.leaves(grads))
         assert (float(sums.terms) == 0.0) == (name == "all infeasible")

@@ -10,9 +10,14 @@ import numpy as np
 
 from rcirl_jax.export import FeatureSpec, PriorCost, RewardWeights, pack, reader, save
 from rcirl_jax.features import feature_map
-from rcirl_jax.reward import RewardConfig, init_reward, pinned
+from rcirl_jax.reward import (
+    RewardConfig,
+    RewardModel,
+    effective_params,
+    init_params,
+)
 from rcirl_jax.reward import value as trained_value
-from rcirl_jax.reward.module import LEAKY_SLOPE
+from rcirl_jax.reward.network import LEAKY_SLOPE, layers_of
 from rcirl_jax.reward.normaliser import Normaliser
 from rcirl_jax.units import TIMES_S
 
@@ -182,25 +187,26 @@ def trained_network(hidden, activation, by_context, count):
     )
     context = feature_map("paper21").context if by_context else ()
     config = RewardConfig(hidden=hidden, activation=activation, context=context)
-    raw = init_reward(jax.random.key(5), size, config)
-    raw = raw.replace(gamma=jnp.asarray(rng.normal(size=18), jnp.float32))
+    raw = init_params(jax.random.key(5), size, config)
+    raw["gamma"] = jnp.asarray(rng.normal(size=18), jnp.float32)
     if by_context:
         drawn = rng.normal(scale=0.2, size=(size, size))
-        raw = raw.replace(context=jnp.asarray(drawn, jnp.float32))
-    effective = pinned(raw, config)
+        raw["scene_gating"] = jnp.asarray(drawn, jnp.float32)
+    effective = effective_params(raw, config)
+    kernels, biases = layers_of(effective["point"])
     wide = 0.5 * (UPPER - LOWER)
     features = rng.uniform(LOWER - wide, UPPER + wide, (count, 18, size))
     features = features.astype(np.float32)
     valid = np.arange(18) < rng.integers(11, 19, (count, 1))
     x, mask = jnp.asarray(features), jnp.asarray(valid)
-    expected = np.asarray(trained_value(raw, normaliser, x, mask, config))
+    expected = np.asarray(trained_value(RewardModel(config), raw, normaliser, x, mask))
     weights = of_the_preset(
         example_weights(),
         **{name: getattr(normaliser, name) for name in reader.RANGES},
-        gamma=effective.gamma,
-        context=effective.context,
-        kernels=effective.kernels,
-        biases=(*effective.biases, np.zeros(1)),
+        gamma=effective["gamma"],
+        context=effective.get("scene_gating"),
+        kernels=tuple(kernels),
+        biases=(*biases, np.zeros(1)),
         activation=activation,
     )
     return weights, features, valid, expected

@@ -12,7 +12,7 @@ from rcirl_jax.features import feature_map
 from rcirl_jax.planner.dp import plan_dp
 from rcirl_jax.planner.grid import DpConfig
 from rcirl_jax.planner.rank import learned_score
-from rcirl_jax.reward import RewardConfig, init_reward, pinned
+from rcirl_jax.reward import RewardConfig, effective_params, init_params
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.types import Candidates, Normaliser
 from tests.helpers.scenes import random_scene
@@ -25,12 +25,12 @@ MIDDLE = DpConfig(step=2.0, max_speed=26.0, max_way=160.0)
 
 @functools.cache
 def weights(seed=0, by_context=False):
-    params = init_reward(jax.random.key(seed), 21, SHAPE)
+    params = init_params(jax.random.key(seed), 21, SHAPE)
     if by_context:
         drawn = np.random.default_rng(seed).normal(0.0, 0.3, (21, 21))
         drawn *= np.asarray(FEATURES.context)[:, None]
-        params = params.replace(context=jnp.asarray(drawn, jnp.float32))
-    params = pinned(params, SHAPE)
+        params["scene_gating"] = jnp.asarray(drawn, jnp.float32)
+    params = effective_params(params, SHAPE)
     lower = np.array([s.lower for s in FEATURES.specs])
     upper = np.array([s.upper for s in FEATURES.specs])
     return params, Normaliser(

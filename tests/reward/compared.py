@@ -2,16 +2,14 @@
 
 import jax.numpy as jnp
 
-from rcirl_jax.reward import Compared
+from rcirl_jax.reward import CandidateInfo, LossInputs
 
 
-def compared(human, candidates, counts=None, weight=None, **facts):
+def compared(human, candidates, feasible=None, weight=None, offset=0.0, **info):
     """Values [B], [B, K] with plain facts unless given."""
     human, candidates = jnp.asarray(human), jnp.asarray(candidates)
     shape = candidates.shape
     plain = {
-        "counts": jnp.ones(shape, bool) if counts is None else jnp.asarray(counts),
-        "weight": jnp.ones(shape[0]) if weight is None else jnp.asarray(weight),
         "human_distance": jnp.zeros(shape[0]),
         "human_collides": jnp.zeros(shape[0], bool),
         "distance": jnp.zeros(shape),
@@ -19,6 +17,12 @@ def compared(human, candidates, counts=None, weight=None, **facts):
         "breaks_rule": jnp.zeros(shape),
         "human_density": jnp.zeros(shape[0]),
         "density": jnp.zeros(shape),
-        "offset": jnp.zeros(()),
     }
-    return Compared(human=human, candidates=candidates, **{**plain, **facts})
+    return LossInputs(
+        human=human,
+        candidates=candidates,
+        feasible=jnp.ones(shape, bool) if feasible is None else jnp.asarray(feasible),
+        weight=jnp.ones(shape[0]) if weight is None else jnp.asarray(weight),
+        info=CandidateInfo(**{**plain, **info}),
+        offset=jnp.asarray(offset),
+    )

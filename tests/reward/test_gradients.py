@@ -7,9 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rcirl_jax.reward import LOSSES, Normaliser, RewardConfig, init_reward
-from rcirl_jax.train.state import Facts, FeatureBatch, TrainConfig
-from rcirl_jax.train.step import compare, gradient_sums
+from rcirl_jax.reward import (
+    LOSSES,
+    CandidateInfo,
+    Normaliser,
+    RewardConfig,
+    RewardModel,
+    init_params,
+)
+from rcirl_jax.reward.network import layers_of
+from rcirl_jax.train.state import FeatureBatch, TrainConfig
+from rcirl_jax.train.step import gradient_sums, loss_inputs
 from rcirl_jax.units import NUM_TIMES as T
 from tests.reward.compared import compared
 from tests.reward.test_losses import oracle
@@ -33,10 +41,10 @@ def unit(x):
 
 def effective(p, config):
     """Float64 parameters with signs and scale as the configuration asks for."""
-    gamma, kernels, biases = p.gamma, list(p.kernels), list(p.biases)
+    gamma, (kernels, biases) = p["gamma"], layers_of(p["point"])
     context = None
-    if p.context is not None:
-        context = p.context * np.array(config.context)[:, None]
+    if config.context:
+        context = p["scene_gating"] * np.array(config.context)[:, None]
     if config.constraint == "nonnegative":
         costs, gamma = unit(np.abs(kernels[0])), unit(np.abs(gamma))
         eye = np.eye(F)
@@ -77,16 +85,16 @@ def drawn(name, config, seed):
     """(parameters, normaliser, batch), float32; some candidates do not count."""
     rng = np.random.default_rng(seed)
     as32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
-    params = init_reward(jax.random.key(seed), F, config)
+    params = init_params(jax.random.key(seed), F, config)
     params = jax.tree.map(lambda x: x + as32(rng.normal(0, 0.3, x.shape)), params)
     if name == "gan":
-        params = params.replace(offset=as32(rng.normal()))
+        params["offset"] = as32(rng.normal())
     normaliser = Normaliser(
         lower=as32(np.full(F, -3.0)), upper=as32(np.full(F, 3.0)),
         location=as32(rng.normal(size=F)), scale=as32(rng.uniform(0.5, 2.0, F)),
     )  # fmt: skip
     pairs = lambda *x: as32(rng.uniform(*x, (B, K)))  # noqa: E731
-    facts = Facts(
+    info = CandidateInfo(
         human_distance=as32(rng.uniform(0, 1, B)), human_collides=jnp.zeros(B, bool),
         distance=pairs(0, 20), collides=pairs(0, 1) < 0.3, breaks_rule=pairs(0, 1),
         human_density=as32(rng.normal(size=B)), density=pairs(-1, 1),
@@ -99,7 +107,7 @@ def drawn(name, config, seed):
     made = FeatureBatch(
         human=as32(human), candidates=as32(candidates), feasible=jnp.asarray(counts),
         time_valid=jnp.arange(T) < jnp.asarray(rng.integers(1, T + 1, (B, 1))),
-        facts=facts, weight=jnp.ones(B), index=jnp.arange(B),
+        info=info, weight=jnp.ones(B), index=jnp.arange(B),
     )  # fmt: skip
     return params, normaliser, made
 
@@ -113,12 +121,11 @@ def loss64(name, config, params, normaliser, made):
     human = value64(params, config, box, as64(made.human), valid)
     points = as64(made.candidates).transpose(0, 3, 2, 1)
     values = value64(params, config, box, points, valid[:, None])
-    facts = {n: as64(x) for n, x in vars(made.facts).items()}
-    offset = np.zeros(()) if params.offset is None else params.offset
+    info = jax.tree.map(as64, made.info)
     c = compared([0.0], [[0.0]])._replace(
-        human=human, candidates=values, counts=as64(made.feasible),
+        human=human, candidates=values, feasible=as64(made.feasible),
         weight=as64(made.weight) * as64(made.feasible).any(axis=1),
-        offset=offset, **facts,
+        offset=params.get("offset", np.zeros(())), info=info,
     )  # fmt: skip
     return oracle(name, c), human, values
 
@@ -135,8 +142,8 @@ def test_loss_and_gradient_equal_float64(name, network, seed):
     config = NETWORKS[network]
     params, normaliser, made = drawn(name, config, seed)
     whole = TrainConfig(loss=name, reward=config)
-    found, sums = SLOPES(params, normaliser, made, whole)
-    compared32 = VALUES(params, normaliser, made, config)
+    found, sums = SLOPES(RewardModel(config).apply, params, normaliser, made, whole)
+    compared32 = VALUES(RewardModel(config).apply, params, normaliser, made)
     exact = jax.tree.map(lambda x: np.asarray(x, np.float64), params)
     loss, human, values = loss64(name, config, exact, normaliser, made)
     np.testing.assert_allclose(compared32.human, human, rtol=2e-4, atol=2e-4)
@@ -157,5 +164,5 @@ def test_loss_and_gradient_equal_float64(name, network, seed):
             assert slope == pytest.approx(wanted, rel=2e-3, abs=5e-4), (number, at)
 
 
-SLOPES = jax.jit(gradient_sums, static_argnums=3)
-VALUES = jax.jit(compare, static_argnums=3)
+SLOPES = jax.jit(gradient_sums, static_argnums=(0, 4))
+VALUES = jax.jit(loss_inputs, static_argnums=0)

@@ -20,7 +20,7 @@ def drawn(seed=0):
     return compared(
         rng.normal(0, 2, B),
         rng.normal(0, 2, (B, K)),
-        counts=rng.random((B, K)) < 0.8,
+        feasible=rng.random((B, K)) < 0.8,
         weight=np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0]),
         human_distance=jnp.asarray(rng.uniform(0, 1, B)),
         distance=jnp.asarray(rng.uniform(0, 20, (B, K))),
@@ -32,29 +32,35 @@ def drawn(seed=0):
     )
 
 
+def with_info(c, **info):
+    return c._replace(info=c.info.replace(**info))
+
+
 def pair_oracle(name, c, b, k):
     y = c.candidates[b, k] - c.human[b]
     if name == "rank":
         return y if y >= 0 else CONFIG.leaky_rate * y
     if name == "logistic":
         return np.log1p(np.exp(y))
-    margin = CONFIG.margin_distance * min(c.distance[b, k], MARGIN_CEILING_M)
-    margin += CONFIG.margin_collision * c.collides[b, k]
-    return max(0.0, y + margin + CONFIG.margin_rule * c.breaks_rule[b, k])
+    margin = CONFIG.margin_distance * min(c.info.distance[b, k], MARGIN_CEILING_M)
+    margin += CONFIG.margin_collision * c.info.collides[b, k]
+    return max(0.0, y + margin + CONFIG.margin_rule * c.info.breaks_rule[b, k])
 
 
 def scene_oracle(name, c, b, ks):
     v, h = c.candidates[b], c.human[b]
     values = np.array([h, *v[ks]])
     if name == "listwise":
-        share = np.exp(values - np.array([c.human_density[b], *c.density[b, ks]]))
-        mean = np.exp(np.mean([c.human_density[b], *c.density[b, ks]]))
+        share = np.exp(
+            values - np.array([c.info.human_density[b], *c.info.density[b, ks]])
+        )
+        mean = np.exp(np.mean([c.info.human_density[b], *c.info.density[b, ks]]))
         return -np.log(np.exp(h) / (mean * share.sum()))
     if name == "soft":
-        apart = np.array([c.human_distance[b], *c.distance[b, ks]])
+        apart = np.array([c.info.human_distance[b], *c.info.distance[b, ks]])
         label = np.exp(-apart / CONFIG.soft_distance)
         # near is no excuse for a collision
-        label *= 1.0 - np.array([c.human_collides[b], *c.collides[b, ks]])
+        label *= 1.0 - np.array([c.info.human_collides[b], *c.info.collides[b, ks]])
         label /= label.sum()
         return -np.sum(label * np.log(np.exp(values) / np.exp(values).sum()))
     real = -np.log(1 / (1 + np.exp(-(h + c.offset))))
@@ -67,7 +73,7 @@ def oracle(name, c):
     c = jax.tree.map(lambda x: np.asarray(x, np.float64), c)
     terms = []
     for b in np.flatnonzero(c.weight):
-        ks = np.flatnonzero(c.counts[b])
+        ks = np.flatnonzero(c.feasible[b])
         if name in ("rank", "logistic", "hinge"):
             terms += [pair_oracle(name, c, b, k) for k in ks]
         else:
@@ -87,11 +93,11 @@ def test_equals_its_definition(name, seed):
 def test_soft_labels_of_collisions():
     """A colliding positive has no label, unless everything collides."""
     c = drawn()
-    hit = c._replace(human_collides=jnp.ones(B, bool))
+    hit = with_info(c, human_collides=jnp.ones(B, bool))
     sums = loss_sums("soft", hit, CONFIG)
     assert float(sums.loss / sums.terms) == pytest.approx(oracle("soft", hit), rel=1e-5)
-    all_hit = hit._replace(collides=jnp.ones((B, K), bool))
-    none_hit = c._replace(collides=jnp.zeros((B, K), bool))
+    all_hit = with_info(hit, collides=jnp.ones((B, K), bool))
+    none_hit = with_info(c, collides=jnp.zeros((B, K), bool))
     assert loss_sums("soft", all_hit, CONFIG) == loss_sums("soft", none_hit, CONFIG)
 
 
@@ -99,13 +105,13 @@ def test_soft_labels_of_collisions():
 def test_padding_and_infeasible_candidates_count_nothing(name):
     whole = drawn()
     keep = np.array([0, 1, 3, 4, 5])
-    part = type(whole)(*[x[keep] if x.ndim else x for x in whole])
+    part = jax.tree.map(lambda x: x[keep] if x.ndim else x, whole)
     for a, b in zip(
         loss_sums(name, whole, CONFIG), loss_sums(name, part, CONFIG), strict=True
     ):
         assert float(a) == pytest.approx(float(b), rel=1e-6)
     wild = whole._replace(
-        candidates=jnp.where(whole.counts, whole.candidates, jnp.inf),
+        candidates=jnp.where(whole.feasible, whole.candidates, jnp.inf),
     )
     assert float(loss_sums(name, wild, CONFIG).loss) == pytest.approx(
         float(loss_sums(name, whole, CONFIG).loss), rel=1e-6
@@ -115,8 +121,8 @@ def test_padding_and_infeasible_candidates_count_nothing(name):
 @pytest.mark.parametrize("name", sorted(LOSSES))
 def test_gradient_is_finite_and_lifts_the_human(name):
     """Also where a scene has no feasible candidate."""
-    c = drawn()._replace(distance=jnp.full((B, K), 30.0), human_distance=jnp.zeros(B))
-    c = c._replace(counts=c.counts.at[1].set(False))
+    c = with_info(drawn(), distance=jnp.full((B, K), 30.0), human_distance=jnp.zeros(B))
+    c = c._replace(feasible=c.feasible.at[1].set(False))
     grad = jax.grad(lambda h: loss_sums(name, c._replace(human=h), CONFIG).loss)
     slope = np.asarray(grad(c.human))
     assert np.isfinite(slope).all()

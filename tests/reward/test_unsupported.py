@@ -7,7 +7,13 @@ import pytest
 
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.rank import RankConfig
-from rcirl_jax.reward import RewardConfig, fit_normaliser, init_reward, value
+from rcirl_jax.reward import (
+    RewardConfig,
+    RewardModel,
+    fit_normaliser,
+    init_params,
+    value,
+)
 from rcirl_jax.reward.normaliser import VARYING_SHARE, unsupported
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import learned_row
@@ -34,19 +40,20 @@ def redrawn(params, seed):
     """The same reward but for the weights that read the unsupported columns."""
     at = jnp.asarray([FEATURES.names.index(name) for name in NEVER])
     draw = lambda x: 5.0 * jax.random.normal(jax.random.key(seed), x.shape)  # noqa: E731
-    first = params.kernels[0]
-    first = first.at[at].set(draw(first[at]))
-    context = params.context
+    first = params["point"]["hidden_0"]
+    first = {**first, "kernel": first["kernel"].at[at].set(draw(first["kernel"][at]))}
+    context = params["scene_gating"]
     context = context.at[at].set(draw(context[at]))
     context = context.at[:, at].set(draw(context[:, at]))
-    return params.replace(kernels=(first, *params.kernels[1:]), context=context)
+    point = {**params["point"], "hidden_0": first}
+    return {**params, "point": point, "scene_gating": context}
 
 
 def weights():
     key = jax.random.key(1)
-    params = init_reward(key, FEATURES.num_features, BY_CONTEXT)
-    shape = params.context.shape
-    params = params.replace(context=0.1 * jax.random.normal(key, shape))
+    params = init_params(key, FEATURES.num_features, BY_CONTEXT)
+    shape = params["scene_gating"].shape
+    params["scene_gating"] = 0.1 * jax.random.normal(key, shape)
     return params, fit_normaliser(rows(), FEATURES)
 
 
@@ -69,14 +76,13 @@ def test_their_weights_change_no_value_and_get_no_gradient(seed):
     params, norm = weights()
     x = np.random.default_rng(seed).uniform(-50.0, 120.0, (7, 18, 21))
     x, valid = jnp.asarray(x, jnp.float32), jnp.ones((7, 18), bool)
-    of = lambda p: value(p, norm, x, valid, BY_CONTEXT)  # noqa: E731
+    of = lambda p: value(RewardModel(BY_CONTEXT), p, norm, x, valid)  # noqa: E731
     np.testing.assert_array_equal(of(params), of(redrawn(params, seed)))
     grad = jax.grad(lambda p: jnp.sum(of(p) ** 2))(params)
     at = [FEATURES.names.index(name) for name in NEVER]
-    assert not np.any(np.asarray(grad.kernels[0])[at])
-    assert np.all(
-        np.any(np.asarray(grad.kernels[0]), axis=1)[: FEATURES.num_features - 8]
-    )
+    slope = np.asarray(grad["point"]["hidden_0"]["kernel"])
+    assert not np.any(slope[at])
+    assert np.all(np.any(slope, axis=1)[: FEATURES.num_features - 8])
 
 
 def test_redrawn_weights_drive_the_same():
@@ -95,5 +101,5 @@ def test_redrawn_weights_drive_the_same():
     for seed in range(2):
         again = driven(redrawn(params, seed))
         assert all(jax.tree.leaves(jax.tree.map(np.array_equal, first, again)))
-    other = params.replace(kernels=(-params.kernels[0], *params.kernels[1:]))
+    other = jax.tree.map(jnp.negative, params)
     assert not np.array_equal(first.s, driven(other).s)

@@ -1,6 +1,7 @@
 """Checkpoints harmed on disk: found, named, passed over; never half-believed."""
 
 import gc
+import json
 import shutil
 import subprocess
 import sys
@@ -10,16 +11,16 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.features import feature_map
+from rcirl_jax.runtime.pipeline import digest
+from rcirl_jax.train import checkpoint
 from rcirl_jax.train.checkpoint import (
     DAMAGED,
     DIGESTS,
     KEEP_LATEST,
     POSITION,
-    SEALED,
     Checkpoints,
 )
-from rcirl_jax.train.loop import _like
+from rcirl_jax.train.loop import blank_state
 from rcirl_jax.train.state import TrainConfig
 from tests.conftest import REPO
 from tests.data.small_logs import files_of
@@ -30,13 +31,12 @@ CONFIG = TrainConfig()
 
 @pytest.fixture(scope="module")
 def state():
-    return _like(CONFIG, feature_map(CONFIG.features))
+    return blank_state(CONFIG)
 
 
 def at(state, step):
     """Another state at every step, to tell them apart."""
-    bias = state.params.biases[0] + step
-    params = state.params.replace(biases=(bias, *state.params.biases[1:]))
+    params = {**state.params, "gamma": state.params["gamma"] + step}
     return state.replace(step=jnp.asarray(step, state.step.dtype), params=params)
 
 
@@ -48,7 +48,7 @@ def saved(state, tmp_path_factory):
     for step in (1, 2, 3, 4):
         checkpoints.save(at(state, step), {"epoch": 0, "index": step})
     checkpoints.close()
-    assert sorted(x.name for x in folder.iterdir()) == [SEALED, "2", "3", "4"]
+    assert sorted(x.name for x in folder.iterdir()) == ["2", "3", "4"]
     assert KEEP_LATEST == 3
     return folder
 
@@ -154,19 +154,22 @@ def test_who_only_reads_leaves_everything_as_it_is(folder, state, tmp_path):
     assert nothing.latest_step() is None
 
 
-@pytest.mark.parametrize("missing", [(DIGESTS,), (DIGESTS, POSITION)])
-def test_checkpoints_of_older_versions_are_taken(folder, state, missing):
-    """Also one that a run of today left there when it was killed."""
-    harmed(folder, *missing)
-    (folder / SEALED).unlink()
-    assert restored(folder, state) == (4, 4, [])
+def test_a_run_killed_while_it_wrote_the_first_ones_starts_again(folder, state):
+    harmed(folder, DIGESTS)
+    checkpoints = Checkpoints(folder)
+    assert checkpoints.latest_step() is None
+    assert len(checkpoints.passed_over) == 3
+    checkpoints.save(at(state, 2), {"epoch": 0, "index": 2})
+    checkpoints.close()
+    assert restored(folder, state) == (2, 2, [])
 
 
 @pytest.mark.parametrize("text", ['["epoch"]', '{"epoch": "0"}', "3"])
 def test_a_position_of_no_numbers_is_named(folder, state, text):
-    harmed(folder, DIGESTS)
     (folder / "4" / POSITION).write_text(text)
-    (folder / SEALED).unlink()
+    files = checkpoint._digests(folder / "4")
+    noted = {"files": files, "sha256": digest(files)}
+    (folder / "4" / DIGESTS).write_text(json.dumps(noted))
     checkpoints = Checkpoints(folder)
     with pytest.raises(InputError, match=r"4/position\.json: .*expected a(n obj| who)"):
         checkpoints.restore(state)
@@ -203,13 +206,12 @@ FULL = """
 import resource, signal, sys
 from pathlib import Path
 from rcirl_jax.errors import InputError
-from rcirl_jax.features import feature_map
 from rcirl_jax.train.checkpoint import Checkpoints
-from rcirl_jax.train.loop import _like
+from rcirl_jax.train.loop import blank_state
 from rcirl_jax.train.state import TrainConfig
 config = TrainConfig()
 checkpoints = Checkpoints(Path(sys.argv[1]))
-state = _like(config, feature_map(config.features))
+state = blank_state(config)
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, resource.RLIM_INFINITY))
 for attempt in range(2):
@@ -232,5 +234,5 @@ def test_no_room_is_one_line_and_room_is_taken_when_there_is_some(folder):
     assert done.returncode == 0, done.stderr
     (line,) = done.stderr.strip().splitlines()
     assert line.startswith(f"{folder}: cannot be written: [Errno 27] File too large")
-    assert sorted(x.name for x in folder.iterdir()) == [SEALED, "3", "4", "5"]
+    assert sorted(x.name for x in folder.iterdir()) == ["3", "4", "5"]
     assert Checkpoints(folder, read_only=True).latest_step() == 5

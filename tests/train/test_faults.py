@@ -15,8 +15,7 @@ from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime import signals as interrupts
 from rcirl_jax.runtime.pipeline import only_one
-from rcirl_jax.train.loop import restore_run, train
-from rcirl_jax.train.running import Running
+from rcirl_jax.train.loop import Running, restore_run, train
 from tests.data.small_logs import CONFIG as IMPORT
 from tests.data.small_logs import files_of, write_logs
 from tests.helpers.stored import assert_same_bits

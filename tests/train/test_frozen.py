@@ -8,9 +8,14 @@ import pytest
 
 from rcirl_jax.evaluation.ranking.learners import train_learner, untrained
 from rcirl_jax.features import feature_map
-from rcirl_jax.train.frozen import fit, freeze, members_of
 from rcirl_jax.train.state import TrainState
-from rcirl_jax.train.step import compare, init_state, make_train_step, mined
+from rcirl_jax.train.step import (
+    init_state,
+    keep_hardest_negatives,
+    loss_inputs,
+    make_train_step,
+)
+from rcirl_jax.train.sweep import fit, freeze, members_of
 from tests.train.test_step import CONFIG, batch, human_is_better, normaliser, rows
 
 SHORT = dataclasses.replace(CONFIG, epochs=3)
@@ -29,7 +34,7 @@ def test_freezing_equals_featurising():
     seen = np.asarray(made.time_valid, np.float64)
     far = np.einsum("skt,st->sk", np.hypot(*np.moveaxis(gap, -1, 0)), seen)
     want = far / seen.sum(axis=1)[:, None]
-    np.testing.assert_allclose(made.facts.distance, want, atol=2e-3)
+    np.testing.assert_allclose(made.info.distance, want, atol=2e-3)
     assert want.max() > 1.0
 
 
@@ -72,16 +77,17 @@ def test_untrained_rows_are_the_first_parameters():
         assert first.loss.size == 0
         for a, b in zip(*map(jax.tree.leaves, (run.params, first.params)), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-5)
-    assert not np.array_equal(*(x.params.kernels[0] for x in untrained(runs)))
+    kernels = (x.params["point"]["hidden_0"]["kernel"] for x in untrained(runs))
+    assert not np.array_equal(*kernels)
 
 
 def test_mining_keeps_what_the_reward_values_most():
     config = dataclasses.replace(CONFIG, hard_negatives=2, hard_pool=3)
     made = freeze(rows(), np.arange(16), config)
     state = init_state(config, normaliser())
-    kept = jax.jit(mined, static_argnums=3)(state.params, normaliser(), made, config)
-    compared = jax.jit(compare, static_argnums=3)
-    values = compared(state.params, normaliser(), made, config.reward).candidates
+    given = state.apply_fn, state.params, normaliser(), made
+    kept = jax.jit(keep_hardest_negatives, static_argnums=(0, 4))(*given, config)
+    values = jax.jit(loss_inputs, static_argnums=0)(*given).candidates
     pool = np.asarray(made.feasible)[:, -6:]
     chosen = np.asarray(kept.feasible)[:, -6:]
     assert (chosen.sum(axis=1) == np.minimum(2, pool.sum(axis=1))).all()

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -23,15 +22,14 @@ from rcirl_jax.export.forms.stablehlo import exported_run
 from rcirl_jax.export.from_run import export_run, read_config, verification_samples
 from rcirl_jax.export.loading import load_runs
 from rcirl_jax.features import feature_map
-from rcirl_jax.reward import RewardConfig, value
+from rcirl_jax.reward import RewardConfig, RewardModel, fit_normaliser, value
 from rcirl_jax.sampling import SamplerConfig
-from rcirl_jax.train import loop
-from rcirl_jax.train.loop import fit_normaliser_on, train
-from rcirl_jax.train.running import check_run
+from rcirl_jax.train import featurise
+from rcirl_jax.train.featurise import normaliser_rows
+from rcirl_jax.train.loop import check_run, step_of, train
 from rcirl_jax.train.state import TrainConfig
 from tests.helpers.stored import assert_same_bits
 
-GOLDEN = Path(__file__).parent / "golden"
 SMALL = SamplerConfig(num_random=4, cruise_times=(4.0,), edge_times=(4.0,))
 CONFIG = TrainConfig(batch_size=8, epochs=3, sampler=SMALL)
 
@@ -73,7 +71,7 @@ def test_resume_is_bitwise(dataset, run, tmp_path):
     workdir = tmp_path / "resumed"
     one = TrainConfig(batch_size=8, epochs=1, sampler=SMALL)
     train(dataset, workdir, one)
-    loop.step_of.cache_clear()
+    step_of.cache_clear()
     resumed = train(dataset, workdir, CONFIG)
     assert_same_bits(resumed.state, run[1].state)
     lines = (workdir / "metrics.jsonl").read_text().splitlines()
@@ -82,17 +80,17 @@ def test_resume_is_bitwise(dataset, run, tmp_path):
 
 
 def test_another_seed_compiles_no_step(dataset, run, tmp_path):
-    loop.step_of.cache_clear()
+    step_of.cache_clear()
     seeds = [dataclasses.replace(CONFIG, epochs=1, seed=seed) for seed in (0, 1)]
     done = [train(dataset, tmp_path / str(x.seed), x) for x in seeds]
-    assert loop.step_of(CONFIG.for_step, "jit").step._cache_size() == 1
-    assert loop.step_of.cache_info().misses == 1
+    assert step_of(CONFIG.for_step, "jit").step._cache_size() == 1
+    assert step_of.cache_info().misses == 1
     slower = dataclasses.replace(CONFIG, learning_rate=1e-4)
-    assert loop.step_of(slower.for_step, "jit").step._cache_size() == 0
+    assert step_of(slower.for_step, "jit").step._cache_size() == 0
     weights = [jax.tree.leaves(x.state.params) for x in done]
     assert any((a != b).any() for a, b in zip(*weights, strict=True))
     # and a first run of a process does not differ from a later one
-    loop.step_of.cache_clear()
+    step_of.cache_clear()
     alone = train(dataset, tmp_path / "alone", seeds[1])
     assert_same_bits(alone.state, done[1].state)
 
@@ -160,24 +158,22 @@ def test_a_run_of_another_module_is_exported_as_stablehlo(dataset, tmp_path):
     x, valid = map(jnp.asarray, verification_samples(dataset, config))
     found = exported_run(tmp_path).call(x, valid[0])
     every = jnp.broadcast_to(valid[:1], valid.shape)
-    want = value(state.params, state.normaliser, x, every, other)
+    want = value(RewardModel(other), state.params, state.normaliser, x, every)
     np.testing.assert_allclose(found, want, rtol=1e-5, atol=1e-5)
 
 
 def test_exported_values_are_the_trainers(dataset, run, tmp_path):
     """The numpy reader and the JAX network agree on fresh scenes to 1e-5."""
-    from rcirl_jax.train.featurise import featurised
-    from rcirl_jax.train.loop import to_device_batch
+    from rcirl_jax.train.featurise import featurised, host_batch
 
     reward = export_run(run[0], dataset, tmp_path / "weights.msgpack")
     index = dataset.indices("test")[:8]
-    batch = to_device_batch(dataset.read(index), np.ones(8), index)
+    batch = host_batch(dataset.read(index), np.ones(8), index)
     features = jax.jit(featurised, static_argnums=2)
     made = features(jax.random.key(9), batch, CONFIG)
     state = run[1].state
-    expected = value(
-        state.params, state.normaliser, made.points, made.points_valid, CONFIG.reward
-    )
+    model, points = RewardModel(CONFIG.reward), (made.points, made.points_valid)
+    expected = value(model, state.params, state.normaliser, *points)
     found = reward.value(np.asarray(made.points), np.asarray(made.points_valid))
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
 
@@ -196,14 +192,6 @@ def test_the_oracle_floor_is_of_scenes_that_cover_the_horizon(dataset):
         oracle_floor(dataset, long, 64)
     with pytest.raises(InputError, match="nowhere"):
         evaluate_ranking(dataset, {}, dataclasses.replace(setup, split="nowhere"))
-
-
-def test_the_run_file_of_an_old_version_reads_with_what_was_usual():
-    """Of 81c261a, with the settings that there were; what came since is as before."""
-    config, run = read_config(GOLDEN)
-    assert config == TrainConfig(futures="recorded", admissible_in="none")
-    assert len(run["config"]) < len(dataclasses.asdict(config))
-    assert run["git_commit"] == "81c261a"
 
 
 def test_a_run_of_a_later_version_is_refused(dataset, run, tmp_path):
@@ -229,9 +217,9 @@ def test_a_run_of_a_later_version_is_refused(dataset, run, tmp_path):
 def test_every_scene_counts_once_for_the_normaliser(dataset, monkeypatch):
     """Whatever the batch, and where the last call is not full."""
     features = feature_map(CONFIG.features)
-    whole = fit_normaliser_on(dataset, CONFIG, features)
+    whole = fit_normaliser(normaliser_rows(dataset, CONFIG), features)
     other = dataclasses.replace(CONFIG, batch_size=3)
-    monkeypatch.setattr(loop, "CHUNK", dataset.indices("train").size - 1)
-    again = fit_normaliser_on(dataset, other, features)
+    monkeypatch.setattr(featurise, "CHUNK", dataset.indices("train").size - 1)
+    again = fit_normaliser(normaliser_rows(dataset, other), features)
     for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)

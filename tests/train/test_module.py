@@ -10,7 +10,7 @@ import pytest
 from rcirl_jax.export.forms.stablehlo import exported_module, write_stablehlo
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.rank import RankConfig, module_score, rank_policy
-from rcirl_jax.reward import RewardConfig, effective_network, value
+from rcirl_jax.reward import RewardConfig, RewardModel, value
 from rcirl_jax.train.step import init_state, make_train_step
 from tests.helpers.scenes import random_scene, sampled
 from tests.train.test_step import CONFIG, batch, human_is_better, normaliser
@@ -33,7 +33,7 @@ def test_learns_a_direction(loss, context):
     assert float(metrics.wins / metrics.pairs) > 0.95
     assert bool(metrics.finite)
     assert ("offset" in state.params) == (loss == "gan")
-    assert ("context" in state.params) == bool(context)
+    assert ("scene_gating" in state.params) == bool(context)
     moved = jax.tree.map(
         lambda a, b: float(jnp.abs(a - b).max()), before.params, state.params
     )
@@ -47,21 +47,21 @@ def test_one_module_trains_exports_and_drives(tmp_path):
     for _ in range(3):
         state, metrics = step(state, batch())
     assert bool(metrics.finite)
-    network, variables = effective_network(state.params, OTHER)
+    model = RewardModel(OTHER)
 
     scene, key = jax.tree.map(jnp.asarray, random_scene(2)), jax.random.key(2)
-    score = module_score(FEATURES, network)
-    assert score is module_score(FEATURES, network)  # or a rollout compiles again
-    weights, planner = (variables, state.normaliser), RankConfig()
+    score = module_score(FEATURES, model)
+    assert score is module_score(FEATURES, model)  # or a rollout compiles again
+    weights, planner = (state.params, state.normaliser), RankConfig()
     candidates = sampled(key, scene, planner.sampler)
     scores = score(weights, scene, candidates)
 
-    made = exported_module(network, variables, state.normaliser)
+    made = exported_module(model, state.params, state.normaliser)
     write_stablehlo(tmp_path / "w.jax", made, "jax")
     again = jax.export.deserialize(bytearray((tmp_path / "w.jax").read_bytes()))
     x = FEATURES.of_candidates(scene, candidates)
     valid = jnp.broadcast_to(scene.time_valid, x.shape[:2])
-    want = value(state.params, state.normaliser, x, valid, OTHER)
+    want = value(model, state.params, state.normaliser, x, valid)
     for found in (again.call(x, scene.time_valid), scores):
         np.testing.assert_allclose(found, want, rtol=1e-5, atol=1e-5)
     assert np.ptp(np.asarray(scores)) > 1e-3

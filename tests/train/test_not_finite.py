@@ -23,7 +23,7 @@ from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.simulation.rollout import SAMPLER_STREAM
 from rcirl_jax.simulation.rows import Row, human_row
 from rcirl_jax.simulation.suite import catalogue_set, suite_refs
-from rcirl_jax.train import loop
+from rcirl_jax.train import featurise
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.units import HORIZON_S
@@ -81,10 +81,10 @@ def test_a_stored_scene_is_named_before_training_sweep_and_ranking(tmp_path, val
 
 def test_the_guard_looks_up_a_scene_that_no_check_saw(tmp_path, monkeypatch):
     """The normaliser is fitted on some training scenes only."""
-    monkeypatch.setattr(loop, "NORMALISER_SCENES", 8)
+    monkeypatch.setattr(featurise, "NORMALISER_SCENES", 8)
     data = stored(tmp_path / "d")
     index = data.indices("train")
-    drawn = np.random.default_rng([CONFIG.seed, loop.NORMALISER_STREAM])
+    drawn = np.random.default_rng([CONFIG.seed, featurise.NORMALISER_STREAM])
     unseen = index[drawn.permutation(index.size)[8:]]
     bad = stored(tmp_path / "bad", int(unseen[0]))
     expected = (
@@ -100,14 +100,14 @@ def test_one_candidate_of_one_scene_is_named(tmp_path, monkeypatch):
     """Made by us from a scene without fault."""
     data = stored(tmp_path / "d")
     place = int(np.flatnonzero(data.indices("train") == TRAINED)[0])
-    whole = loop.featurised
+    whole = featurise.featurised
 
     def broken(key, given, config):
         made = whole(key, given, config)
         at = int(np.flatnonzero(np.asarray(given.index) == place)[0])
         return made.replace(candidates=made.candidates.at[at, 9, 2, 0].set(np.inf))
 
-    monkeypatch.setattr(loop, "featurised", broken)
+    monkeypatch.setattr(featurise, "featurised", broken)
     expected = f"^train: {line(TRAINED)}feature jerk: not finite: expected finite num"
     with pytest.raises(InputError, match=expected):
         train(data, tmp_path / "run", CONFIG)

@@ -13,7 +13,7 @@ import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.train.loop import restore_run
-from rcirl_jax.train.processes import EXIT_LOST, join_processes
+from rcirl_jax.train.parallel import EXIT_LOST, join_processes
 from tests.conftest import REPO
 from tests.helpers.stored import assert_same_bits, leaves
 from tests.train.worker import CONFIG

@@ -23,18 +23,16 @@ from rcirl_jax.evaluation.ranking.sweep import (
     open_split,
     train_group,
 )
+from rcirl_jax.export import sweep as folders
 from rcirl_jax.export.loading import compiled_scorer, open_reward
-from rcirl_jax.export.sweep import run as folders
-from rcirl_jax.export.sweep.result import table
-from rcirl_jax.export.sweep.run import run_sweep
+from rcirl_jax.export.sweep import run_sweep, table
 from rcirl_jax.report.charts import sweep_picture
-from rcirl_jax.reward import RewardConfig
+from rcirl_jax.reward import CandidateInfo, RewardConfig
 from rcirl_jax.runtime.executors import Processes, Serial
 from rcirl_jax.runtime.pipeline import only_one
-from rcirl_jax.train import frozen
-from rcirl_jax.train.frozen import fit, freeze, members_of
-from rcirl_jax.train.pieces import piece_size
-from rcirl_jax.train.state import Facts, FeatureBatch, TrainConfig
+from rcirl_jax.train import sweep as members_sweep
+from rcirl_jax.train.state import FeatureBatch, TrainConfig
+from rcirl_jax.train.sweep import fit, freeze, members_of
 from rcirl_jax.units import HORIZON_S
 from tests.conftest import REPO
 from tests.data.small_logs import files_of
@@ -70,7 +68,7 @@ def config_of(data, **changes):
 def finished(data, tmp_path_factory):
     """(folder, report) of a sweep in this process."""
     folder = tmp_path_factory.mktemp("finished")
-    frozen._fit.clear_cache()
+    members_sweep._fit.clear_cache()
     return folder, run_sweep(config_of(data), folder, Serial(), MADE_BY)
 
 
@@ -106,7 +104,7 @@ def test_members_equal_single_runs(data, monkeypatch):
 
 def test_a_group_is_one_compile_however_many_chunks(data, monkeypatch):
     monkeypatch.setattr(sweep, "MEMBERS_AT_ONCE", 3)
-    frozen._fit.clear_cache()
+    members_sweep._fit.clear_cache()
     config = config_of(data, leaky_rates=(0.05, 0.1, 0.3), seeds=1)
     parts = list(train_group((7,), config)) + list(train_group((3, 2), config))
     assert [len(part.members) for part in parts] == [3, 3, 3, 3]
@@ -114,14 +112,14 @@ def test_a_group_is_one_compile_however_many_chunks(data, monkeypatch):
 
 
 def test_many_members_fit():
-    """Pieces bound what members hold while a step runs; their number hardly counts."""
+    """Microbatches bound what members hold in a step; their number hardly counts."""
     members, batch_size = 64, 64
     reward = RewardConfig(hidden=(64,))
     config = dataclasses.replace(BASE, batch_size=batch_size, reward=reward)
     who = members_of([config] * members)
     order = jax.random.key(0)
-    given = (many(64), normaliser(), order, who, config, 18)
-    lowered = frozen._fit.lower(*given)
+    given = (many(64), normaliser(), order, who, config)
+    lowered = members_sweep._fit.lower(*given)
     held = lowered.compile().memory_analysis().temp_size_in_bytes
     one_layer = 4 * members * batch_size * 128 * 18 * 64
     assert one_layer > 2e9
@@ -137,7 +135,7 @@ def many(scenes=16, candidates=128):
     around = lambda *x: middle + 0.1 * width * rng.normal(size=x)  # noqa: E731
     distance = jnp.asarray(rng.uniform(0.0, 9.0, pairs), jnp.float32)
     of_scenes, of_pairs = jnp.zeros(scenes), jnp.zeros(pairs)
-    facts = Facts(
+    info = CandidateInfo(
         human_distance=of_scenes, human_collides=jnp.zeros(scenes, bool),
         distance=distance, collides=distance > 8.0, breaks_rule=of_pairs,
         human_density=of_scenes, density=of_pairs,
@@ -147,18 +145,10 @@ def many(scenes=16, candidates=128):
         candidates=jnp.asarray(around(*shape), jnp.float32).transpose(0, 3, 2, 1),
         feasible=jnp.asarray(rng.random(pairs) < 0.8),
         time_valid=jnp.ones((scenes, 18), bool),
-        facts=facts,
+        info=info,
         weight=jnp.ones(scenes),
         index=jnp.arange(scenes, dtype=jnp.int32),
     )
-
-
-def test_pieces_divide_the_batch_and_stay_in_bounds(monkeypatch):
-    assert piece_size(64, 64) == 1
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    sizes = [piece_size(size, most) for size, most in ((64, 99), (60, 7), (7, 6))]
-    assert sizes == [64, 6, 1]
-    assert piece_size(64, 0) == 1
 
 
 def test_times_that_no_scene_compares_change_nothing():
@@ -255,7 +245,7 @@ import sys
 from pathlib import Path
 import ray
 from rcirl_jax.runtime.executors import Ray
-from rcirl_jax.export.sweep.run import run_sweep
+from rcirl_jax.export.sweep import run_sweep
 from tests.train.test_sweep import MADE_BY, config_of
 ray.init(num_cpus=2, log_to_driver=False, logging_level="ERROR")
 run_sweep(config_of(sys.argv[1]), Path(sys.argv[2]), Ray("auto"), MADE_BY)

@@ -7,12 +7,8 @@ import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.sweep import point_name
-from rcirl_jax.export.sweep import run as folders
-from rcirl_jax.export.sweep import search as searches
-from rcirl_jax.export.sweep.choice import Found
-from rcirl_jax.export.sweep.result import read_sweep, table
-from rcirl_jax.export.sweep.run import run_sweep
-from rcirl_jax.export.sweep.search import ROUND, searched
+from rcirl_jax.export import sweep as folders
+from rcirl_jax.export.sweep import ROUND, Found, read_sweep, run_sweep, searched, table
 from rcirl_jax.report.charts import sweep_picture
 from rcirl_jax.runtime.executors import Serial
 from tests.helpers.commands import refused
@@ -69,7 +65,7 @@ def test_what_was_tried_before_is_not_trained_again():
 def test_a_search_goes_on_and_more_trials_go_on_where_it_ended(
     data, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(searches, "ROUND", 2)
+    monkeypatch.setattr(folders, "ROUND", 2)
     small = {"hidden_sizes": ((),), "seeds": 1}
     trained, real = [], folders.train_group
 

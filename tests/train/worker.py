@@ -14,9 +14,8 @@ from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.runtime.signals import Interrupted
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.checkpoint import DIGESTS
-from rcirl_jax.train.loop import train
-from rcirl_jax.train.processes import join_processes
-from rcirl_jax.train.running import Running
+from rcirl_jax.train.loop import Running, train
+from rcirl_jax.train.parallel import join_processes
 from rcirl_jax.train.state import TrainConfig
 
 # plain gradient steps: Adam would hide a wrong scale of the gradient

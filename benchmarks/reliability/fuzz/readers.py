@@ -31,8 +31,7 @@ from rcirl_jax.evaluation.closed_loop.runs import (
 from rcirl_jax.export.from_run import last_metrics, read_config
 from rcirl_jax.export.loading import check_provenance
 from rcirl_jax.export.reader import decode_weights
-from rcirl_jax.export.sweep.folder import SWEEP
-from rcirl_jax.export.sweep.result import read_sweep
+from rcirl_jax.export.sweep import SWEEP, read_sweep
 from rcirl_jax.features import mapping
 from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.runtime.pipeline import Stages
@@ -41,8 +40,8 @@ from rcirl_jax.simulation.catalogue import families
 from rcirl_jax.simulation.catalogue.build import build_case
 from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.train import checkpoint
+from rcirl_jax.train.loop import check_run, describe_run
 from rcirl_jax.train.metrics import pairs_won
-from rcirl_jax.train.running import check_run, describe_run
 from rcirl_jax.train.state import TrainConfig
 from tests.data.formats import fixtures as formats
 from tests.data.formats import people, test_csv_meaning, test_csv_ways

@@ -19,13 +19,15 @@ from rcirl_jax.features import feature_map
 from rcirl_jax.reward import (
     Normaliser,
     RewardConfig,
+    RewardModel,
     RewardParams,
     fit_normaliser,
     value,
 )
-from rcirl_jax.train.frozen import Fitted, first_params, fit, freeze, members_of
-from rcirl_jax.train.loop import CHUNK, NORMALISER_SCENES, rows_that_count
+from rcirl_jax.train.featurise import CHUNK, NORMALISER_SCENES, valid_feature_rows
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
+from rcirl_jax.train.step import init_state
+from rcirl_jax.train.sweep import Fitted, fit, freeze, members_of
 
 # What a learner changes of the shared configuration: loss, fields of its network,
 # others of its training. The linear rewards are not pinned: with unit norm their
@@ -76,7 +78,7 @@ LEARNERS: dict[str, tuple[str, dict, dict]] = {
 }  # fmt: skip
 
 # one program for all runs of a shape: their weights are arguments
-_value = jax.jit(value, static_argnums=4)
+_value = jax.jit(value, static_argnums=0)
 
 # learners whose features are scaled by the scene; the columns come from the preset
 BY_CONTEXT = ("logistic by context", "non-negative by context")
@@ -102,9 +104,9 @@ class Learned:
         """
 
         def scorer(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
-            of, shape = (self.params, self.normaliser), self.config.reward
+            of = (RewardModel(self.config.reward), self.params, self.normaliser)
             parts = [slice(i, i + CHUNK) for i in range(0, len(x), CHUNK)]
-            values = [_value(*of, x[part], valid[part], shape) for part in parts]
+            values = [_value(*of, x[part], valid[part]) for part in parts]
             return np.concatenate([np.asarray(made) for made in values])
 
         return scorer
@@ -164,7 +166,7 @@ class FrozenSets:
             made = freeze(self.rows, self.index, key)
             made = made.replace(weight=jnp.asarray(self.weights))
             if self.nearest:
-                apart = jnp.where(made.feasible, made.facts.distance, jnp.inf)
+                apart = jnp.where(made.feasible, made.info.distance, jnp.inf)
                 place = jnp.argsort(jnp.argsort(apart, axis=1), axis=1)
                 made = made.replace(feasible=made.feasible & (place < self.nearest))
             self._made[key] = made
@@ -176,7 +178,7 @@ def fitting_rows(frozen: FeatureBatch, config: TrainConfig) -> np.ndarray:
     count = frozen.weight.shape[0]
     chosen = np.random.default_rng(config.seed).permutation(count)
     some = jax.tree.map(lambda x: np.asarray(x)[chosen[:NORMALISER_SCENES]], frozen)
-    return rows_that_count(some)
+    return valid_feature_rows(some)
 
 
 def normaliser_of(
@@ -241,8 +243,7 @@ def untrained(runs: Sequence[Learned]) -> list[Learned]:
     nothing, made = np.zeros(0), []
     for run in runs:
         config = dataclasses.replace(run.config, reward=RewardConfig(), loss="rank")
-        count = feature_map(config.features).num_features
-        params = first_params(config.seed, count, config)
+        params = init_state(config, run.normaliser).params
         made.append(
             dataclasses.replace(
                 run, params=params, config=config, loss=nothing, wins=nothing

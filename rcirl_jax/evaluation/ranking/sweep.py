@@ -1,7 +1,7 @@
 """Batch sweeps: networks, leaky rates, step sizes and seeds, a grid or proposed ones.
 
 All members with one network shape are a group. A group trains side by side in one
-compiled program (`train.frozen`), `MEMBERS_AT_ONCE` at a time, and is the piece of
+compiled program (`train.sweep`), `MEMBERS_AT_ONCE` at a time, and is the piece of
 work that goes to an executor; what comes out does not depend on the executor.
 
 The training split is cut into scenes to fit and scenes to choose by
@@ -39,8 +39,8 @@ from rcirl_jax.features import feature_map
 from rcirl_jax.reward import Normaliser, RewardParams, seen_range
 from rcirl_jax.runtime.compiling import compiles
 from rcirl_jax.runtime.executors import Executor
-from rcirl_jax.train.frozen import PROGRAM, fit, freeze, members_of
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
+from rcirl_jax.train.sweep import PROGRAM, fit, freeze, members_of
 
 MOST_MEMBERS = 100_000  # of a sweep
 MEMBERS_AT_ONCE = 16  # per call: enough to share the scenes, few enough to see progress

@@ -8,7 +8,7 @@ compilers (IREE, XLA). K is symbolic; T, F and the weights are constants.
 """
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +18,8 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.export.from_run import read_config
 from rcirl_jax.export.loading import reward_params
 from rcirl_jax.export.reader import Reward
-from rcirl_jax.reward import Normaliser, ValueNetwork, effective_network
-from rcirl_jax.reward.module import module_value, network_of, variables_of
+from rcirl_jax.reward import Normaliser, RewardModel, RewardParams, effective_model
+from rcirl_jax.reward.network import scene_values
 from rcirl_jax.runtime.atomic_files import write_whole
 from rcirl_jax.train.loop import restore_run
 
@@ -36,8 +36,8 @@ def exported(reward: Reward) -> jax.export.Exported:
     if np.any(reward.biases[-1]):
         raise InputError(f"{reward.file}: layers: output bias: expected 0")
     effective, normaliser = reward_params(reward)
-    network = network_of(effective, str(reward.activation))
-    return exported_module(network, variables_of(effective), normaliser)
+    model = effective_model(effective, str(reward.activation))
+    return exported_module(model, effective, normaliser)
 
 
 def exported_run(workdir: Path) -> jax.export.Exported:
@@ -48,24 +48,23 @@ def exported_run(workdir: Path) -> jax.export.Exported:
     """
     config, _ = read_config(workdir)
     state = restore_run(workdir, config)
-    network, variables = effective_network(state.params, config.reward)
-    return exported_module(network, variables, state.normaliser)
+    return exported_module(RewardModel(config.reward), state.params, state.normaliser)
 
 
 def exported_module(
-    network: ValueNetwork, variables: dict[str, Any], normaliser: Normaliser
+    model: RewardModel, params: RewardParams, normaliser: Normaliser
 ) -> jax.export.Exported:
     """V of a module with K left open, for CPUs and NVIDIA GPUs."""
 
     def program(features: jax.Array, valid: jax.Array) -> jax.Array:
-        every = jnp.broadcast_to(valid, features.shape[:-1])
-        return module_value(network, variables, normaliser, features, every)
+        x = features.transpose(2, 1, 0)
+        return scene_values(model, params, normaliser, valid, x)[0]
 
     (count,) = jax.export.symbolic_shape("k")
-    shape = (count, network.times, normaliser.scale.shape[0])
+    shape = (count, model.times, normaliser.scale.shape[0])
     shapes = (
         jax.ShapeDtypeStruct(shape, jnp.float32),
-        jax.ShapeDtypeStruct((network.times,), jnp.bool_),
+        jax.ShapeDtypeStruct((model.times,), jnp.bool_),
     )
     return jax.export.export(jax.jit(program), platforms=("cpu", "cuda"))(*shapes)
 

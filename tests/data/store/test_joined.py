@@ -6,10 +6,9 @@ import pytest
 from rcirl_jax.data.store import joined
 from rcirl_jax.errors import InputError
 from rcirl_jax.sampling import SamplerConfig
-from rcirl_jax.train.featurise import featurised
-from rcirl_jax.train.loop import to_device_batch
+from rcirl_jax.train.featurise import featurised, host_batch
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.train.step import gradient_sums, init_params
+from rcirl_jax.train.step import gradient_sums, init_state
 from rcirl_jax.types import Normaliser
 from tests.helpers.scenes import batch, demonstration
 
@@ -86,15 +85,15 @@ def test_a_scene_of_weight_two_counts_as_often_as_two():
         location=jnp.zeros(21),
         scale=jnp.full(21, 10.0),
     )
-    params = init_params(jax.random.key(0), 21, config)
+    state = init_state(config, norm)
 
     def sums(weight):
         made = featurised(
             jax.random.key(0),
-            to_device_batch(rows, np.asarray(weight, np.float32), index),
+            host_batch(rows, np.asarray(weight, np.float32), index),
             config,
         )
-        return gradient_sums(params, norm, made, config)[1]
+        return gradient_sums(state.apply_fn, state.params, norm, made, config)[1]
 
     first, second, both = sums([1, 0]), sums([0, 1]), sums([2, 0.5])
     for name in ("loss", "terms", "pairs"):

@@ -1,0 +1,239 @@
+"""The Flax module: its equation, parameters, scale, signs, gates, other modules."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.features import feature_map
+from rcirl_jax.reward import (
+    LossConfig,
+    Normaliser,
+    RewardConfig,
+    RewardModel,
+    effective_model,
+    effective_params,
+    init_params,
+    loss_sums,
+    value,
+)
+from rcirl_jax.reward.network import layers_of, user_module
+from rcirl_jax.units import TIMES_S
+from tests.reward.compared import compared
+
+FEATURES = feature_map("paper21")
+F, T, K = 21, TIMES_S.size, 5
+GATED = RewardConfig(context=FEATURES.context)
+CONFIGS = {
+    "linear": {"hidden": ()},
+    "paper": {},
+    "deep, leaky": {"hidden": (8, 4), "activation": "leaky_relu"},
+    "relu, free": {"activation": "relu", "pin": "none"},
+    "nonnegative": {"hidden": (), "constraint": "nonnegative"},
+    "monotone": {"constraint": "monotone", "signs": FEATURES.signs},
+}
+
+
+def drawn(config, seed=0):
+    """Parameters that are nowhere 0."""
+    params, rng = init_params(jax.random.key(seed), F, config), np.random.default_rng(1)
+    add = lambda x: x + jnp.asarray(rng.normal(0.0, 0.3, x.shape), jnp.float32)  # noqa: E731
+    return jax.tree.map(add, params)
+
+
+def normaliser():
+    rng = np.random.default_rng(4)
+    full = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    return Normaliser(
+        lower=full(np.full(F, -3.0)),
+        upper=full(np.full(F, 3.0)),
+        location=full(rng.normal(size=F)),
+        scale=full(rng.uniform(0.5, 2.0, F)),
+    )
+
+
+def trajectories(count=K, seed=2):
+    """Features [K, T, F] that are alike at t = 0 as those of one scene are."""
+    x = np.random.default_rng(seed).normal(0.0, 2.0, (count, T, F))
+    shared = np.asarray(FEATURES.context) > 0
+    x[:, 0, shared] = x[0, 0, shared]
+    return jnp.asarray(x, jnp.float32)
+
+
+def values(params, x, config, valid=None):
+    valid = jnp.ones(T, bool) if valid is None else valid
+    every = jnp.broadcast_to(valid, x.shape[:-1])
+    return value(RewardModel(config), params, normaliser(), x, every)
+
+
+@pytest.mark.parametrize("gated", [False, True])
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_scene_in_one_pass_is_each_trajectory_by_itself(name, gated):
+    """Values and gradients of the Siamese pair, raw or by the effective module."""
+    context = FEATURES.context if gated else ()
+    config = RewardConfig(**CONFIGS[name], context=context)
+    x, valid = trajectories(), jnp.arange(T) < 11
+
+    own = RewardModel(config)
+
+    def apart(params):
+        return values(params, x, config, valid)
+
+    def together(params, model=own):
+        rows = x.transpose(2, 1, 0)
+        pair = rows[..., :1], rows[..., 1:]
+        found = model.apply({"params": params}, normaliser(), valid, *pair)
+        return jnp.concatenate(found)
+
+    def both(form):
+        total = lambda params: (jnp.sum(jnp.sin(form(params))), form(params))  # noqa: E731
+        return jax.grad(total, has_aux=True)(drawn(config))
+
+    near = lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-5)  # noqa: E731
+    jax.tree.map(near, both(together), both(apart))
+    effective = effective_params(drawn(config), config)
+    model = effective_model(effective, config.hidden_activation)
+    near(together(effective, model), apart(drawn(config)))
+
+
+def test_parameters_of_another_shape_are_refused():
+    """Filling up hidden units hides no row that is missing."""
+    config = RewardConfig(hidden=(5,), pin="none")
+    for layer in ("hidden_0", "out"):
+        params = drawn(config)
+        short = params["point"][layer]["kernel"][:-1]
+        params["point"][layer] = {**params["point"][layer], "kernel": short}
+        with pytest.raises(Exception, match=r"contracting|shape"):
+            values(params, trajectories(), config)
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+def test_a_fixed_scale_keeps_the_order(activation):
+    free = RewardConfig(activation=activation, pin="none")
+    unit = RewardConfig(activation=activation, pin="unit")
+    params, x = drawn(free), trajectories(50)
+    unit_values = values(params, x, unit)
+    if activation == "tanh":
+        free_values = values(params, x, free)
+        np.testing.assert_array_equal(np.argsort(free_values), np.argsort(unit_values))
+    out = {"kernel": 7.0 * params["point"]["out"]["kernel"]}
+    grown = {"gamma": 10.0 * params["gamma"], "point": {**params["point"], "out": out}}
+    np.testing.assert_allclose(values(grown, x, unit), unit_values, rtol=1e-4)
+    effective = effective_params(params, unit)
+    for part in (effective["gamma"], effective["point"]["out"]["kernel"]):
+        assert float(jnp.linalg.norm(part)) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_a_free_rank_loss_has_no_lower_bound_and_one_of_fixed_scale_has():
+    """Growing the output layer makes the loss as negative as one likes."""
+    rng = np.random.default_rng(0)
+    human = jnp.asarray(rng.normal(1.0, 0.1, (8, T, F)), jnp.float32)
+    others = jnp.asarray(rng.normal(-1.0, 0.1, (8, 5, T, F)), jnp.float32)
+
+    def loss(scale, pin):
+        config = RewardConfig(hidden=(), pin=pin)
+        params = init_params(jax.random.key(0), F, config)
+        params["point"] = {"out": {"kernel": scale * jnp.ones((F, 1))}}
+        v, w = (values(params, x, config) for x in (human, others))
+        sums = loss_sums("rank", compared(v, w), LossConfig())
+        return float(sums.loss / sums.terms)
+
+    assert loss(100.0, "none") == pytest.approx(100.0 * loss(1.0, "none"), rel=1e-3)
+    assert loss(100.0, "unit") == pytest.approx(loss(1.0, "unit"), rel=1e-3)
+
+
+@pytest.mark.parametrize("hidden", [(), (15,), (8, 4)])
+def test_monotone_rewards_never_fall_with_a_safety_term(hidden):
+    signs = (1, -1, *[0] * (F - 2))
+    config = RewardConfig(hidden=hidden, constraint="monotone", signs=signs)
+    moved = np.zeros(2)
+    for seed in range(5):
+        params, x = drawn(config, seed), trajectories(40, seed)
+        slope = jax.grad(lambda x, p=params: jnp.sum(values(p, x, config)))(x)
+        slope = np.asarray(slope)
+        assert (slope[..., 0] >= 0.0).all()
+        assert (slope[..., 1] <= 0.0).all()
+        moved += np.abs(slope[..., 2]).max(), (slope[..., 2] < 0).mean()
+    assert (moved > 0).all()
+
+
+def test_an_untrained_gating_changes_nothing():
+    params = init_params(jax.random.key(3), F, GATED)
+    got = values(params, trajectories(), GATED)
+    del params["scene_gating"]
+    np.testing.assert_array_equal(got, values(params, trajectories(), RewardConfig()))
+
+
+def test_acceleration_and_jerk_at_the_start_set_no_gate():
+    """The gates are those of the scene, whichever trajectory they are read from."""
+    params, x = drawn(GATED), trajectories()
+    first = [FEATURES.names.index(name) for name in ("acceleration", "jerk")]
+    moved, valid = x.at[:, 0, jnp.asarray(first)].add(1.0), jnp.arange(T) > 0
+    plain = values(params, x, GATED, valid)
+    np.testing.assert_array_equal(plain, values(params, moved, GATED, valid))
+    other = x.at[:, 0, FEATURES.names.index("velocity")].add(0.1)
+    assert np.abs(values(params, other, GATED, valid) - plain).max() > 1e-4
+    rows = jnp.asarray(moved.at[1:].set(x[1:])).transpose(2, 1, 0)
+    (found,) = RewardModel(GATED).apply({"params": params}, normaliser(), valid, rows)
+    np.testing.assert_allclose(found, plain, rtol=1e-5, atol=1e-5)
+
+
+def test_the_gradient_reaches_the_gating_from_zero():
+    def gap(params):
+        found = values(params, trajectories(), GATED)
+        return found[0] - found[1]
+
+    params = init_params(jax.random.key(3), F, GATED)
+    slope = np.asarray(jax.grad(gap)(params)["scene_gating"])
+    masked = np.asarray(FEATURES.context) == 0
+    assert np.isfinite(slope).all()
+    assert not slope[masked].any()
+    assert np.abs(slope[~masked]).max() > 1e-4
+
+
+def test_first_parameters():
+    """Glorot uniform kernels, biases 0, equal time weights; another seed another."""
+    params, other = (init_params(jax.random.key(i), F, GATED) for i in (0, 1))
+    (first, out), (bias,) = layers_of(params["point"])
+    assert (first.shape, out.shape) == ((F, 15), (15, 1))
+    assert 0.5 < np.abs(first).max() / np.sqrt(6.0 / (F + 15)) <= 1.0
+    assert not bias.any()
+    np.testing.assert_allclose(params["gamma"], T**-0.5, rtol=1e-6)
+    assert not np.array_equal(first, layers_of(other["point"])[0][0])
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        ({"activation": "step"}, "activation: step: expected one of"),
+        ({"pin": "loose"}, "pin: loose: expected one of"),
+        ({"hidden": (15,), "constraint": "nonnegative"}, "hidden: "),
+        ({"context": (1, 0)}, "context: 2 columns: expected 21"),
+        ({"module": "no_such_room:Reward"}, "no_such_room.*No module named"),
+        ({"module": "json:Reward"}, "no attribute"),
+        ({"module": "json:JSONDecoder"}, "no flax.linen.Module"),
+        ({"module": "tests.reward.others:Needy"}, "missing 1 required"),
+        ({"module": "Reward"}, "expected package.module:Class"),
+        ({"module": "tests.reward.others:Wide"}, r"\(2, 18, 3\) of \(2, 18, 21\): "),
+        ({"module": "tests.reward.others:Stateful"}, r"\['batch_stats', 'params'\]"),
+        ({"module": "tests.reward.others:Nameless"}, "pin: unit.*last layer `out`"),
+        (
+            {"module": "tests.reward.others:Wide", "constraint": "monotone"},
+            "constraint: monotone: expected none",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_one_line(given, says):
+    with pytest.raises(InputError, match=says):
+        init_params(jax.random.key(0), F, RewardConfig(**given))
+
+
+def test_a_module_without_an_out_layer_trains_free():
+    made = RewardConfig(module="tests.reward.others:Nameless", pin="none")
+    assert set(init_params(jax.random.key(0), F, made)) == {"gamma", "point"}
+    assert user_module(made.module) is user_module(made.module)
+    with pytest.raises(InputError, match=r"weights\.msgpack"):
+        dataclasses.replace(made).check_own()
