@@ -10,6 +10,7 @@ import scipy.stats
 from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteConfig,
     run_suite,
+    worst_cases,
     write_suite,
 )
 from rcirl_jax.evaluation.closed_loop.summary import summarise
@@ -106,3 +107,5 @@ def test_files_say_the_same(result, tmp_path):
     faults = [int(r["at_fault"]) for r in rows if r["row"] == "constant speed"]
     np.testing.assert_array_equal(faults, result.runs["constant speed"].at_fault)
     assert {r["case"] for r in rows} == set(result.cases.ids)
+    worst = worst_cases(result, "constant speed", 3)
+    assert all(name.startswith("stopped_lead/") for name in worst)

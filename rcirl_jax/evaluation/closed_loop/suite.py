@@ -180,3 +180,16 @@ def write_suite(
         result.cases.parameters,
     )
     return text
+
+
+def worst_cases(result: SuiteResult, row: str, count: int = 10) -> list[str]:
+    """Ids of the cases of a row to look at first: faults, red lights, low progress."""
+    metrics = result.runs[row]
+    key = (
+        1000.0 * (np.asarray(metrics.at_fault) > 0)
+        + 100.0 * (np.asarray(metrics.red_lights) > 0)
+        + 100.0 * (np.asarray(metrics.stop_signs) > 0)
+        + np.asarray(metrics.max_j) / 100.0
+    )
+    order = np.argsort(-key, kind="stable")[:count]
+    return [result.cases.ids[i] for i in order.tolist()]
