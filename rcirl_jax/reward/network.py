@@ -394,7 +394,9 @@ def value(
     """
 
     def one(x: jax.Array, valid: jax.Array) -> jax.Array:
-        rows = jnp.where(valid, x.T, 0.0)[:, :, None]  # whatever is at other times
+        # whatever stands at times that do not count; gates read the first
+        kept = valid.at[0].set(True) if model.config.context else valid
+        rows = jnp.where(kept, x.T, 0.0)[:, :, None]
         return scene_values(model, params, normaliser, valid, rows)[0][0]
 
     for _ in range(features.ndim - 2):
