@@ -57,8 +57,8 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     lengths = _leader_lengths(files, section(spec, "table"))
     for file in files:
         table, stats = open_log(file, spec)
-        leader = _ids(file)[2]
-        options = {"user": None, "places": PLACES, "name_of": lambda _, n=leader: n}
+        follower = _ids(file)[1]
+        options = {"user": None, "places": PLACES, "name_of": lambda _, n=follower: n}
         rows = read_log(table, stats, NEEDED, OPTIONAL, **options)
         made = _recording(file, spec, rows, groups[file], lengths)
         yield validate_recording(attach_row_stats(made, stats), file)
