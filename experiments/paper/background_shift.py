@@ -28,6 +28,7 @@ import numpy as np
 import optax
 from absl import flags
 from matplotlib.axes import Axes
+from numpy.typing import ArrayLike
 
 from rcirl_jax.cli.running import provenance, run
 from rcirl_jax.evaluation.statistics import clopper_pearson, combine_seeds
@@ -206,7 +207,7 @@ def draw_examples(
     return jax.lax.map(one, keys, batch_size=DRAWS_AT_ONCE)
 
 
-def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def angle_deg(a: ArrayLike, b: ArrayLike) -> np.ndarray:
     """Returns the angle between directions of unit norm [..., F], in degrees."""
     cosine = jnp.clip(jnp.sum(jnp.asarray(a) * jnp.asarray(b), axis=-1), -1.0, 1.0)
     return np.asarray(jnp.degrees(jnp.arccos(cosine)))
@@ -262,9 +263,11 @@ def draw(path: Path, frames: Frames, found: dict[str, Learned]) -> None:
     alone, pooled, within = axes[0]
 
     def arrow(axis: Axes, name: str, start: np.ndarray, *, again: bool = False) -> None:
-        end = start + ARROW * found[name].direction
+        end = start + ARROW * np.asarray(found[name].direction)
         style = {"arrowstyle": "-|>", "color": COLOURS[name], "lw": 2.2}
-        axis.annotate("", xy=tuple(end), xytext=tuple(start), arrowprops=style)
+        axis.annotate(
+            "", xy=(end[0], end[1]), xytext=(start[0], start[1]), arrowprops=style
+        )
         if again:
             return
         angle = float(angle_deg(found[name].direction, TRUTH))

@@ -147,6 +147,19 @@ def test_no_scorer_beats_the_oracle(seed):
     assert np.all(other["top3_fde"] >= best)
 
 
+def test_pairs_are_counted_behind_the_mask():
+    """Whatever an infeasible candidate is worth, it is no pair and wins none."""
+    o = make(3)
+    values, human = random_scorer(1, o.fde.shape)
+    pairs = o.feasible.sum(axis=1)
+    below = np.sum(o.feasible & (values < human[:, None]), axis=1)
+    for worth in (-1e9, 1e9):
+        found = scene_metrics(np.where(o.feasible, values, worth), human, o)
+        np.testing.assert_array_equal(found["num_pairs"], np.maximum(pairs, 1))
+        share = below / np.maximum(pairs, 1)
+        np.testing.assert_allclose(found["pairwise_accuracy"], share)
+
+
 def mean_nll(values, o, temperature):
     some = o.feasible.any(axis=1)
     found = scene_metrics(values, np.zeros(len(values)), o, temperature)
