@@ -23,7 +23,7 @@ from absl import app, flags
 from benchmarks.common import untrained, write
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.plan import no_plan
-from rcirl_jax.planner.prediction import as_seen
+from rcirl_jax.planner.prediction import with_predicted_futures
 from rcirl_jax.planner.rank import (
     ONLINE,
     RankConfig,
@@ -78,7 +78,7 @@ def _rows() -> dict[str, Row]:
     return {
         "sampler": (draw, (keys, scenes)),
         "F": (jax.vmap(features.rows), (scenes, candidates)),
-        "prediction": (jax.vmap(as_seen), (scenes,)),
+        "prediction": (jax.vmap(with_predicted_futures), (scenes,)),
         "filter": (jax.vmap(check), (scenes, candidates)),
         "hand-set cost": (
             jax.vmap(lambda *x: hand_score(None, *x)),
