@@ -21,7 +21,6 @@ from rcirl_jax.export.loading import open_reward
 _RUN = flags.DEFINE_string("run", None, "folder of a training run", required=True)
 _OUTPUT = flags.DEFINE_string("output", None, "weights file to write", required=True)
 _DATA = flags.DEFINE_list("data", [], "datasets, where they have moved")
-_RANGES = flags.DEFINE_bool("ranges", True, "record what training saw, for the guard")
 _STABLEHLO = flags.DEFINE_string("stablehlo", None, "StableHLO bytecode to write")
 
 
@@ -30,7 +29,7 @@ def main() -> None:
     workdir, output = Path(_RUN.value), Path(_OUTPUT.value)
     dataset = open_datasets(_DATA.value or datasets_of(workdir))
     dataset = with_tags(dataset, tags_of(workdir))
-    reward = export_run(workdir, dataset, output, ranges=_RANGES.value)
+    reward = export_run(workdir, dataset, output)
     print(f"{output}: {len(reward.names)} features, sha256 {reward.sha256[:16]}")
     if _STABLEHLO.value:
         scorer = exported(open_reward(str(output)))

@@ -19,7 +19,7 @@ from rcirl_jax.report.frames import _sampled
 from rcirl_jax.report.pages import TERMS, explained, interval
 from rcirl_jax.report.player import case_lines
 from rcirl_jax.report.replays import _broken_words, goes_as
-from rcirl_jax.report.tuning_page import cards
+from rcirl_jax.report.tuning_page import cards, outcome_of
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.metrics import COLUMNS
 from rcirl_jax.units import TIMES_S
@@ -199,6 +199,13 @@ def test_terms_are_explained_where_they_stand_and_in_a_list(page):
     )
     kept = Markup("<b>miss</b>")
     assert explained(kept) == kept
+
+
+def test_a_loss_is_never_called_no_difference(report):
+    (check, *_) = [check for check in report.verdict.checks if check.kind == "gain"]
+    for p, word in ((0.004, "worse"), (0.2, "no difference")):
+        seen = dataclasses.replace(check, difference=-0.02, p=p, outcome="open")
+        assert outcome_of(seen) == (word, "open")
 
 
 def test_the_papers_table_is_the_suites(page, report):

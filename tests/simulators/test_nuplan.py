@@ -125,6 +125,11 @@ def test_it_stops_behind_who_stands_and_before_a_red_light(planner):
     assert 80.0 < x[-1] + 2.6 <= 100.0
 
 
+def test_a_green_light_stops_nobody(planner):
+    lights = [light(20, "GREEN"), light(31, "UNKNOWN")]
+    assert planned(planner, ego(x=60.0), lights=lights)[-1, 1] > 130.0
+
+
 def test_a_route_without_lanes_is_refused(planner):
     with pytest.raises(InputError, match="route_roadblock_ids: no lanes"):
         planner.initialize(
