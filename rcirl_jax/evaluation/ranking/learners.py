@@ -17,6 +17,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.score import Scorer
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import (
+    LOSSES,
     Normaliser,
     RewardConfig,
     RewardModel,
@@ -113,14 +114,15 @@ class Learned:
 
 
 def learner_config(name: str, base: TrainConfig) -> TrainConfig:
-    """The configuration of a named learner.
+    """Returns the configuration of a row of `LEARNERS`, or of a loss by its name.
 
     Raises:
-      InputError: no learner of that name.
+      InputError: no learner or loss of that name.
     """
-    if name not in LEARNERS:
-        raise InputError(f"learners: {name}: expected some of {sorted(LEARNERS)}")
-    loss, network, more = LEARNERS[name]
+    if name not in LEARNERS and name not in LOSSES:
+        known = sorted([*LEARNERS, *LOSSES])
+        raise InputError(f"learners: {name}: expected some of {known}")
+    loss, network, more = LEARNERS.get(name, (name, {}, {}))
     config = dataclasses.replace(base, loss=loss, **more)
     features = feature_map(config.features)
     reward = dataclasses.replace(base.reward, **network)
