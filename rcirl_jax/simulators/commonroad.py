@@ -23,6 +23,8 @@ BY_REWARD = "reactive planner, reward as cost"
 WORKER = "rcirl_jax.simulators.commonroad_worker"
 LENGTH_M, WIDTH_M = 4.508, 1.61  # m, of the car that the reactive planner plans for
 LANE_WIDTH_M = 3.5  # m
+# what the worker says of each of the others
+BODY = ["kind", "x", "y", "heading", "speed", "acceleration", "length", "width"]
 
 
 class CommonRoad:
@@ -104,6 +106,9 @@ class Replay:
         if not self.now:
             return None
         x, y, heading, speed, acceleration, curvature = self.now["ego"]
+        others = [dict(zip(BODY, row, strict=True)) for row in self.now["others"]]
+        for other in others:
+            other["heading"] = math.remainder(other["heading"], math.tau)
         return View(
             ego=Car(
                 x=x,
@@ -116,7 +121,7 @@ class Replay:
                 width=WIDTH_M,
             ),
             centre_line=self.line.centre_line,
-            obstacles=[_body(*row) for row in self.now["others"]],
+            obstacles=[Body(**other) for other in others],
             way=self.way,
             speed_limit=self.now["limit"],
         )
@@ -141,26 +146,3 @@ class Replay:
         """End the process."""
         self.process.kill()
         self.process.communicate()
-
-
-def _body(
-    kind: str,
-    x: float,
-    y: float,
-    heading: float,
-    speed: float,
-    acceleration: float,
-    length: float,
-    width: float,
-) -> Body:
-    """Return one of the others, from what the worker says of it."""
-    return Body(
-        kind=kind,
-        x=x,
-        y=y,
-        heading=math.remainder(heading, math.tau),
-        speed=speed,
-        acceleration=acceleration,
-        length=length,
-        width=width,
-    )

@@ -65,16 +65,15 @@ class RewardCost:
     def _costs(self, trajectories: Sequence[Any]) -> np.ndarray:
         """Return minus the values of samples [K]."""
         assert self.scene is not None, "look at a scene before planning"
-        s, l = np.stack([self._centre(x.curvilinear) for x in trajectories], axis=1)
+        ways = []  # stations and offsets m of the ego's centre at `TIMES_S`
+        for found in (sample.curvilinear for sample in trajectories):
+            s = found.s + self.rear_axle * np.cos(found.theta) - self.station
+            l = found.d + self.rear_axle * np.sin(found.theta)
+            time = self.dt * np.arange(len(s))
+            ways.append([np.interp(TIMES_S, time, x) for x in (s, l)])
+        s, l = np.stack(ways, axis=1)
         features = self.columns(self.scene, s, l)
         return -self.reward.value(features, self.scene.time_valid)
-
-    def _centre(self, found: Any) -> list[np.ndarray]:  # noqa: ANN401
-        """Return stations and offsets m of the ego's centre at `TIMES_S`."""
-        s = found.s + self.rear_axle * np.cos(found.theta) - self.station
-        l = found.d + self.rear_axle * np.sin(found.theta)
-        time = self.dt * np.arange(len(s))
-        return [np.interp(TIMES_S, time, x) for x in (s, l)]
 
 
 def obstacle(kind: str, size: tuple[float, float], track: np.ndarray) -> Obstacle:

@@ -91,20 +91,15 @@ class HighwayEpisode:
         self.env.reset(seed=zlib.crc32(name.encode()))
         self.road = self.env.road
         self._ways: dict[tuple, Way] = {}
-        self.ego = self._take_over(own)
+        # our ego, or an IDMVehicle, in the place of the environment's
+        theirs, kind = self.env.vehicle, Planned if own is None else IDMVehicle
+        self.ego: Any = kind(self.road, theirs.position, theirs.heading, theirs.speed)
+        if own is not None:
+            self.ego.enable_lane_change = own == CHANGES
+            self.ego.target_speed = float(self.ego.lane.speed_limit)
+        self.road.vehicles[self.road.vehicles.index(theirs)] = self.ego
         self._lane, self._driven = self.ego.lane_index, 0.0
         self._station, _ = self.way().project(*self.ego.position)
-
-    def _take_over(self, own: str | None) -> Any:  # noqa: ANN401
-        """Put our ego, or an IDMVehicle, in the place of the environment's."""
-        theirs = self.env.vehicle
-        kind: Any = Planned if own is None else IDMVehicle
-        ego = kind(self.road, theirs.position, theirs.heading, theirs.speed)
-        if own is not None:
-            ego.enable_lane_change = own == CHANGES
-            ego.target_speed = float(ego.lane.speed_limit)
-        self.road.vehicles[self.road.vehicles.index(theirs)] = ego
-        return ego
 
     def way(self) -> Way:
         """Return the way along the ego's lane and those that follow it."""

@@ -123,17 +123,6 @@ def log_of(samples: Sequence[Mapping[str, float]]) -> EpisodeLog:
     return {name: np.array([x[name] for x in samples]) for name in samples[0]}
 
 
-def _record(log: EpisodeLog, size: int) -> Record:
-    """Return a log as a record [size] of the closed loop."""
-    leaves = {}
-    for name in Record.__dataclass_fields__:
-        kind = np.int32 if name in COUNTS else bool if name in MARKS else np.float32
-        leaves[name] = np.full(size, REST.get(name, 0.0), kind)
-        if name in log:
-            leaves[name][: len(log[name])] = log[name]
-    return Record(**leaves)
-
-
 @jax.jit
 @jax.vmap
 def _measured(record: Record) -> CaseMetrics:
@@ -144,5 +133,13 @@ def measure(logs: Sequence[EpisodeLog]) -> CaseMetrics:
     """Return the closed loop's measures of drives, leaves [N, ...]; numpy."""
     longest = max(len(log["v"]) for log in logs)
     size = -(-longest // LENGTHS) * LENGTHS
-    records = [_record(log, size) for log in logs]
+    records = []  # [size]
+    for log in logs:
+        leaves = {}
+        for name in Record.__dataclass_fields__:
+            kind = np.int32 if name in COUNTS else bool if name in MARKS else np.float32
+            leaves[name] = np.full(size, REST.get(name, 0.0), kind)
+            if name in log:
+                leaves[name][: len(log[name])] = log[name]
+        records.append(Record(**leaves))
     return jax.device_get(_measured(jax.tree.map(lambda *x: np.stack(x), *records)))

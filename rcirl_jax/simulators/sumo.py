@@ -59,6 +59,15 @@ STATES = {"r": "red", "u": "red", "y": "yellow", "Y": "yellow"}  # others: green
 MOST_MPS = 25.0  # m/s, above every speed of an ego
 FREE = 0  # no checks of speed or of lane changes
 KRAUSS = "Krauss"
+SPREAD = 'speedFactor="normc(1,0.1,0.7,1.3)"'
+TYPES = (  # the others: Krauss drivers, each with a speed of its own; and the ego
+    '<vTypeDistribution id="others">',
+    f'<vType id="car" probability="{1 - TRUCKS}" {SPREAD}/>',
+    '<vType id="truck" vClass="truck" length="10" accel="1.3" '
+    f'probability="{TRUCKS}" {SPREAD}/>',
+    "</vTypeDistribution>",
+    '<vType id="ego" speedFactor="1" speedDev="0"/>',
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,11 +118,25 @@ class Corridors:
                     *("--no-warnings", "true", "--duration-log.disable", "true"),
                 ]
             )
-        _shift_lights(episodes)
+        # every light's cycle begins somewhere
+        for light in libsumo.trafficlight.getIDList():
+            draw = random.Random(f"{episodes[int(light.partition('.')[0])]} {light}")
+            phases = libsumo.trafficlight.getAllProgramLogics(light)[0].phases
+            phase = draw.randrange(len(phases))
+            rest = draw.uniform(0.0, phases[phase].duration)
+            libsumo.trafficlight.setPhase(light, phase)
+            libsumo.trafficlight.setPhaseDuration(light, rest)
         self._sizes: dict[str, tuple[float, float]] = {}
         egos = [f"{n}.ego" for n in range(len(episodes))]
-        _warm_up(egos)
-        on_the_road = set(libsumo.vehicle.getIDList())
+        on_the_road: set[str] = set()
+        # the traffic drives until every ego is on its road, or has waited enough
+        while libsumo.simulation.getTime() < WARM_UP_S + ENTRY_S:
+            libsumo.simulationStep()
+            for name in set(egos) & set(libsumo.simulation.getDepartedIDList()):
+                libsumo.vehicle.setLaneChangeMode(name, FREE)
+            on_the_road = set(libsumo.vehicle.getIDList())
+            if set(egos) <= on_the_road:
+                break
         self._egos = [
             Ego(name, n, own) if name in on_the_road else None
             for n, name in enumerate(egos)
@@ -209,6 +232,10 @@ class Ego:
         x, y, heading, curvature = self._way.place(front - 0.5 * length)
         own = get.getAcceleration(self.name)
         before, self._next = self._next, self._light()
+        passed_red = False
+        if before is not None and before != self._next:
+            shows = libsumo.trafficlight.getRedYellowGreenState(before[0])[before[1]]
+            passed_red = STATES.get(shows) == "red"
         return View(
             ego=Car(
                 x=x,
@@ -225,7 +252,7 @@ class Ego:
             signals=self._signals(front),
             way=front - self._start,
             speed_limit=self._way.limit(front),
-            passed_red=int(before != self._next and _shows_red(before)),
+            passed_red=int(passed_red),
         )
 
     def _front(self) -> float:
@@ -260,14 +287,6 @@ class Ego:
         return found
 
 
-def _shows_red(light: tuple[str, int] | None) -> bool:
-    """Return whether there is a light and it is red for a link."""
-    if light is None:
-        return False
-    shows = libsumo.trafficlight.getRedYellowGreenState(light[0])[light[1]]
-    return STATES.get(shows) == "red"
-
-
 def _lanes(edges: Sequence[str]) -> tuple[dict[str, float], Way]:
     """Return stations m where a way's lanes begin, and the way: lane 0 of each edge."""
     begins, points, limits, station = {}, [], [], 0.0
@@ -287,28 +306,6 @@ def _lanes(edges: Sequence[str]) -> tuple[dict[str, float], Way]:
     return begins, Way(np.concatenate(points), np.array(limits), width)
 
 
-def _warm_up(egos: Sequence[str]) -> None:
-    """Let the traffic drive until every ego is on its road, or has waited enough."""
-    while libsumo.simulation.getTime() < WARM_UP_S + ENTRY_S:
-        libsumo.simulationStep()
-        for name in set(egos) & set(libsumo.simulation.getDepartedIDList()):
-            libsumo.vehicle.setLaneChangeMode(name, FREE)
-        if set(egos) <= set(libsumo.vehicle.getIDList()):
-            return
-
-
-def _shift_lights(episodes: Sequence[str]) -> None:
-    """Begin every light's cycle somewhere."""
-    for light in libsumo.trafficlight.getIDList():
-        draw = random.Random(f"{episodes[int(light.partition('.')[0])]} {light}")
-        phases = libsumo.trafficlight.getAllProgramLogics(light)[0].phases
-        phase = draw.randrange(len(phases))
-        libsumo.trafficlight.setPhase(light, phase)
-        libsumo.trafficlight.setPhaseDuration(
-            light, draw.uniform(0.0, phases[phase].duration)
-        )
-
-
 # ------------------------------------------------------- the files that SUMO reads
 
 
@@ -326,7 +323,7 @@ def write_corridors(folder: Path, episodes: Sequence[str]) -> tuple[Path, Path]:
         edges += _edges(number, kind, draw)
         traffic += _traffic(number, kind)
     by_depart = [element for _, element in sorted(traffic, key=lambda x: x[0])]
-    files = {"nodes": nodes, "edges": edges, "routes": [*_types(), *by_depart]}
+    files = {"nodes": nodes, "edges": edges, "routes": [*TYPES, *by_depart]}
     for root, elements in files.items():
         text = "\n".join([f"<{root}>", *elements, f"</{root}>"])
         (folder / f"{root}.xml").write_text(text + "\n")
@@ -389,19 +386,6 @@ def _edges(number: int, kind: Kind, draw: random.Random) -> Iterator[str]:
         for (into, out), end in (("ab", f"s{k}"), ("de", f"t{k}")):
             yield edge(f"{into}{k}", end, f"n{k}", 1, LIMITS_MPS[1], 1)
             yield edge(f"{out}{k}", f"n{k}", end, 1, LIMITS_MPS[1], 1)
-
-
-def _types() -> list[str]:
-    """Return the others: Krauss drivers, each with a speed of its own; and the ego."""
-    spread = 'speedFactor="normc(1,0.1,0.7,1.3)"'
-    return [
-        '<vTypeDistribution id="others">',
-        f'<vType id="car" probability="{1 - TRUCKS}" {spread}/>',
-        f'<vType id="truck" vClass="truck" length="10" accel="1.3" '
-        f'probability="{TRUCKS}" {spread}/>',
-        "</vTypeDistribution>",
-        '<vType id="ego" speedFactor="1" speedDev="0"/>',
-    ]
 
 
 def _traffic(number: int, kind: Kind) -> Iterator[tuple[float, str]]:
