@@ -49,9 +49,8 @@ PANELS = {
     "top3_fde": ("best of the three highest", "m, lower is better"),
     "percentile_rank": ("rank of the human's curve", "share below, higher is better"),
 }
-# rates of a sweep, and inches of one panel
+# rates of a sweep
 AXES = {"leaky_rate": "leaky rate a", "learning_rate": "step size"}
-WIDTH, HEIGHT = 5.5, 4.2  # inches of one panel
 WIDTH, HEIGHT = 5.5, 4.2  # inches of one panel
 
 Interval = tuple[float, float, float]  # value, low, high
@@ -63,7 +62,7 @@ def _place(value: float, limit: float) -> str:
 
 
 def forest_cell(
-    found: tuple[float, float, float],
+    found: Interval,
     *,
     limit: float,
     margin: float | None,
@@ -85,9 +84,7 @@ def forest_cell(
     return part("forest_cell", at, low, high, line, failed, words)
 
 
-def interval_cell(
-    found: tuple[float, float, float], ends: tuple[float, float], words: str
-) -> Markup:
+def interval_cell(found: Interval, ends: tuple[float, float], words: str) -> Markup:
     """Draw a row of intervals on an axis of their own, without a zero line.
 
     Args:

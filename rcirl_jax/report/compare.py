@@ -176,20 +176,17 @@ def _settings(stages: Mapping[str, dict], verdict: _VerdictFile) -> dict[str, st
         if name not in said | of_gate
     }
     found |= _flat(made.get("versions"), "version")
-    return {name: _said(value) for name, value in found.items()}
+    said_of = {}
+    for name, value in found.items():
+        text = ", ".join(map(str, value)) if isinstance(value, list | tuple) else value
+        said_of[name] = "–" if text is None or text == "" else str(text)
+    return said_of
 
 
 def _flat(tree: object, name: str) -> dict[str, object]:
     """Return leaves of nested settings, by "name: field.field"."""
     found = leaves(tree) if isinstance(tree, Mapping) else {}
     return {f"{name}: {n}": x for n, x in found.items() if x is not None}
-
-
-def _said(value: object) -> str:
-    """Return a setting as text; "–" where it is none."""
-    if isinstance(value, list | tuple):
-        value = ", ".join(map(str, value))
-    return "–" if value is None or value == "" else str(value)
 
 
 def _of_verdict(verdict: _VerdictFile) -> dict[str, Interval]:
@@ -245,6 +242,22 @@ def write_comparison(
       runs: two or more, in the order in which they are shown.
       facts: provenance of the page.
     """
+    # settings that differ, and those of `ALWAYS`
+    rows, marked = [], []
+    for name in dict.fromkeys(name for run in runs for name in run.settings):
+        cells = [run.settings.get(name, "–") for run in runs]
+        differs = len(set(cells)) > 1
+        if differs or name in ALWAYS:
+            rows.append((name, *cells))
+        if differs and name in ALWAYS:
+            marked.append(name)
+    settings = Table(
+        caption="Recipe, data, commit, and settings that differ",
+        heads=("", *(run.name for run in runs)),
+        rows=rows,
+        kind="wrap",
+        marked=marked,
+    )
     return write_page(
         path,
         "compare.html",
@@ -252,32 +265,11 @@ def write_comparison(
         runs=[
             {"run": run, "kind": DECISIONS.get(run.decision, "open")} for run in runs
         ],
-        settings=settings_table(runs),
+        settings=settings,
         metrics=[metric_table(name, runs) for name in METRICS],
         level=f"{100.0 * CONFIDENCE:g} %",
         facts=facts_text(facts),
         incumbents=len({run.incumbent for run in runs}),
-    )
-
-
-def settings_table(runs: Sequence[ComparedRun]) -> Table:
-    """Return settings that differ, and those of `ALWAYS`."""
-    names = dict.fromkeys(name for run in runs for name in run.settings)
-    rows, marked = [], []
-    for name in names:
-        cells = [run.settings.get(name, "–") for run in runs]
-        differs = len(set(cells)) > 1
-        if differs or name in ALWAYS:
-            rows.append((name, *cells))
-        if differs and name in ALWAYS:
-            marked.append(name)
-    heads = ("", *(run.name for run in runs))
-    return Table(
-        caption="Recipe, data, commit, and settings that differ",
-        heads=heads,
-        rows=rows,
-        kind="wrap",
-        marked=marked,
     )
 
 

@@ -92,44 +92,31 @@ def contributions(
         name: _shares_of(reward, rows, index, sampler)
         for name, reward in rewards.items()
     }
-    shares = {name: one[0] for name, one in found.items()}
     units = {
         f: u for r in rewards.values() for f, u in zip(r.names, r.units, strict=True)
     }
-    table = [_row(name, unit, shares, bootstrap) for name, unit in units.items()]
-    leading = next(iter(rewards))
-
-    def size(row: Contribution) -> float:
-        share = row.share[leading]
-        return 0.0 if share is None else share.value
-
+    table = []
+    for feature, unit in units.items():
+        columns = [one[0].get(feature) for one in found.values()]
+        difference = None
+        if len(columns) > 1 and columns[0] is not None and columns[1] is not None:
+            difference = paired_difference(columns[0], columns[1], bootstrap)
+        share = {
+            name: None if column is None else combine_seeds(column, bootstrap)
+            for name, column in zip(found, columns, strict=True)
+        }
+        row = Contribution(
+            feature=feature, unit=unit, share=share, difference=difference
+        )
+        leading = next(iter(share.values()))
+        table.append((0.0 if leading is None else leading.value, row))
+    table.sort(key=lambda item: -item[0])
     return Contributions(
-        rows=tuple(sorted(table, key=lambda row: -size(row))),
+        rows=tuple(row for _, row in table),
         scenes=len(index),
         vehicles=bootstrap.num_clusters,
         features={name: one[1:] for name, one in found.items()},
         valid=np.asarray(rows.scene.time_valid),
-    )
-
-
-def _row(
-    feature: str,
-    unit: str,
-    shares: Mapping[str, Mapping[str, np.ndarray]],
-    bootstrap: ClusterBootstrap,
-) -> Contribution:
-    columns = [table.get(feature) for table in shares.values()]
-    difference = None
-    if len(columns) > 1 and columns[0] is not None and columns[1] is not None:
-        difference = paired_difference(columns[0], columns[1], bootstrap)
-    return Contribution(
-        feature=feature,
-        unit=unit,
-        share={
-            name: None if column is None else combine_seeds(column, bootstrap)
-            for name, column in zip(shares, columns, strict=True)
-        },
-        difference=difference,
     )
 
 
@@ -235,7 +222,14 @@ def _shares_table(found: Contributions, names: Sequence[str]) -> Table:
                 else interval((one.value, one.low, one.high), 1, 100.0) + " %"
             )
         if len(names) > 1:
-            cells += _changed(row.difference)
+            apart, word, said = row.difference, "", ""
+            if apart is not None:
+                word = "no difference"
+                if not apart.low <= 0.0 <= apart.high:
+                    word = "counts more" if apart.mean > 0.0 else "counts less"
+                values = (apart.mean, apart.low, apart.high)
+                said = interval(values, 1, 100.0, signed=True)
+            cells += [said, word]
         share = row.share[names[0]]
         rows.append([*cells, part("bar", 0.0 if share is None else share.value)])
     caption = (
@@ -244,16 +238,6 @@ def _shares_table(found: Contributions, names: Sequence[str]) -> Table:
         f"{found.vehicles} vehicles; 95 % intervals over vehicles"
     )
     return Table(caption=caption, heads=[*heads, ""], rows=rows, kind="bars")
-
-
-def _changed(found: Difference | None) -> list[object]:
-    if found is None:
-        return ["", ""]
-    word = "no difference"
-    if not found.low <= 0.0 <= found.high:
-        word = "counts more" if found.mean > 0.0 else "counts less"
-    values = (found.mean, found.low, found.high)
-    return [interval(values, 1, 100.0, signed=True), word]
 
 
 def response_curves(rewards: Mapping[str, Reward], found: Contributions) -> Markup:

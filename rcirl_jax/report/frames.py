@@ -40,7 +40,6 @@ from rcirl_jax.types import (
     Kind,
     Scene,
     Tag,
-    Trajectory,
 )
 from rcirl_jax.units import TIMES_S
 
@@ -108,15 +107,6 @@ def _sampled(preset: str, sampler: SamplerConfig) -> Callable:
     return jax.jit(made)
 
 
-def _only(trajectory: Trajectory) -> Candidates:
-    """Return a trajectory as the only candidate."""
-    return Candidates(
-        trajectory=jax.tree.map(lambda x: x[None], trajectory),
-        feasible=jnp.ones(1, bool),
-        family=jnp.zeros(1, jnp.int32),
-    )
-
-
 def _driven_by(
     reward: Reward,
     scene: Scene,
@@ -152,6 +142,11 @@ def draw_frame(
     feasible = np.asarray(candidates.feasible)
     chosen = int(np.argmax(np.where(feasible, values, -np.inf)))
     drawn = one.replace(human=human)
+    only_human = Candidates(
+        trajectory=jax.tree.map(lambda x: x[None], human),
+        feasible=jnp.ones(1, bool),
+        family=jnp.zeros(1, jnp.int32),
+    )
     names = [tag.name.lower() for tag in Tag if bool(one.scene.tags[tag])]
     weights = reward_params(reward)
     parts = _attributed(*weights, x[chosen], x_human, valid, reward.activation)
@@ -179,7 +174,7 @@ def draw_frame(
         values=values,
         feasible=feasible,
         human_value=float(
-            _driven_by(reward, one.scene, _only(human), x_human[None], valid[None])[0]
+            _driven_by(reward, one.scene, only_human, x_human[None], valid[None])[0]
         ),
         human_s=np.asarray(human.s),
         chosen_s=np.asarray(candidates.trajectory.s[chosen]),
@@ -265,30 +260,44 @@ def draw_obstacles(axis: Axes, scene: Scene) -> None:
             )
 
 
+def _draw_candidates(
+    axis: Axes,
+    demonstration: Demonstration,
+    candidates: Candidates,
+    leaf: str,
+    how: dict,
+) -> None:
+    """Draw a leaf (s, v) of some feasible candidates over time, in grey."""
+    values = np.asarray(getattr(candidates.trajectory, leaf))
+    feasible = np.flatnonzero(np.asarray(candidates.feasible))
+    for row in values[feasible[:: max(len(feasible) // SHOWN_CANDIDATES, 1)]]:
+        shown = _mask(row, np.asarray(demonstration.scene.time_valid))
+        axis.plot(TIMES_S, shown, color=CANDIDATE, **how)
+
+
+def _draw_both(
+    axis: Axes,
+    demonstration: Demonstration,
+    candidates: Candidates,
+    chosen: int,
+    leaf: str,
+) -> list[np.ndarray]:
+    """Draw a leaf (s, v) of the human and, dashed, of the chosen; return both [T]."""
+    valid = np.asarray(demonstration.scene.time_valid)
+    human = _mask(np.asarray(getattr(demonstration.human, leaf)), valid)
+    axis.plot(TIMES_S, human, color=HUMAN, lw=2, label="human")
+    best = _mask(np.asarray(getattr(candidates.trajectory, leaf)[chosen]), valid)
+    axis.plot(TIMES_S, best, "--", color=CHOSEN, lw=2, label="chosen")
+    return [human, best]
+
+
 def draw_st_graph(
     axis: Axes, demonstration: Demonstration, candidates: Candidates, chosen: int
 ) -> None:
     """Draw obstacles, candidates, human and chosen on one station-time graph."""
-    valid = np.asarray(demonstration.scene.time_valid)
-    stations = np.asarray(candidates.trajectory.s)
-    feasible = np.flatnonzero(np.asarray(candidates.feasible))
-    step = max(len(feasible) // SHOWN_CANDIDATES, 1)
-    for k in feasible[::step]:
-        axis.plot(
-            TIMES_S, _mask(stations[k], valid), color=CANDIDATE, lw=0.5, alpha=0.5
-        )
+    _draw_candidates(axis, demonstration, candidates, "s", {"lw": 0.5, "alpha": 0.5})
     draw_obstacles(axis, demonstration.scene)
-    human = _mask(np.asarray(demonstration.human.s), valid)
-    axis.plot(TIMES_S, human, color=HUMAN, lw=2, label="human")
-    axis.plot(
-        TIMES_S,
-        _mask(stations[chosen], valid),
-        "--",
-        color=CHOSEN,
-        lw=2,
-        label="chosen",
-    )
-    top = np.nanmax(np.concatenate([human, _mask(stations[chosen], valid)]))
+    top = np.nanmax(_draw_both(axis, demonstration, candidates, chosen, "s"))
     axis.set_ylim(-10.0, 1.6 * top + 15.0)
     axis.legend(fontsize=8, loc="upper left", frameon=False)
     label(axis, "station-time graph", "t, s", "station, m")
@@ -318,7 +327,11 @@ def example_frame(
     made, axes = figure(2, 3, 13.0, 7.2)
     valid = np.asarray(demonstration.scene.time_valid)
     draw_st_graph(axes[0, 0], demonstration, candidates, chosen)
-    _draw_speeds(axes[0, 1], demonstration, candidates, chosen)
+    speeds = axes[0, 1]
+    _draw_candidates(speeds, demonstration, candidates, "v", {"lw": 0.4, "alpha": 0.4})
+    _draw_both(speeds, demonstration, candidates, chosen, "v")
+    speeds.set_ylim(bottom=0.0)
+    label(speeds, "speed: human (solid), chosen (dashed)", "t, s", "m/s")
     panels = [axes[0, 2], *axes[1]]
     for axis, (name, title, kind) in zip(panels, DISTANCES, strict=True):
         if name not in names:
@@ -333,20 +346,3 @@ def example_frame(
         axis.set_ylim(bottom=min(0.0, float(np.min(human_features[:, column]))))
         label(axis, title, "t, s", "m")
     return save(made, path)
-
-
-def _draw_speeds(
-    axis: Axes, demonstration: Demonstration, candidates: Candidates, chosen: int
-) -> None:
-    valid = np.asarray(demonstration.scene.time_valid)
-    speeds = np.asarray(candidates.trajectory.v)
-    feasible = np.flatnonzero(np.asarray(candidates.feasible))
-    step = max(len(feasible) // SHOWN_CANDIDATES, 1)
-    for row in speeds[feasible[::step]]:
-        axis.plot(TIMES_S, _mask(row, valid), color=CANDIDATE, lw=0.4, alpha=0.4)
-    axis.plot(
-        TIMES_S, _mask(np.asarray(demonstration.human.v), valid), color=HUMAN, lw=2
-    )
-    axis.plot(TIMES_S, _mask(speeds[chosen], valid), "--", color=CHOSEN, lw=2)
-    axis.set_ylim(bottom=0.0)
-    label(axis, "speed: human (solid), chosen (dashed)", "t, s", "m/s")

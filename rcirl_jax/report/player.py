@@ -14,7 +14,7 @@ from rcirl_jax.report.pages import Table, facts_text, part, write_page
 from rcirl_jax.report.replays import Replay, broken_bounds, goes_as
 from rcirl_jax.report.style import CANDIDATE, CLASS_COLOURS, HUMAN_LOOK, LOOKS, Look
 from rcirl_jax.simulation.catalogue.families import family_title
-from rcirl_jax.simulation.metrics import CaseMetrics, nuplan_score
+from rcirl_jax.simulation.metrics import nuplan_score
 from rcirl_jax.simulation.rows import RECORDED_HUMAN
 
 SCRIPT = ("drawing.js", "player.js", "cases.js")
@@ -40,19 +40,16 @@ def looks(rows: Sequence[str]) -> dict[str, Look]:
 def player_data(replays: Sequence[Replay]) -> dict:
     """Return the variable `replays` of player.html."""
     met = {kind for one in replays for kind, _, _ in one.bodies.values()}
+    cases = [dataclasses.asdict(one) for one in replays]
+    for case in cases:
+        how = looks([drive["row"] for drive in case["drives"]])
+        for drive in case["drives"]:
+            drive["look"] = dataclasses.asdict(how[drive["row"]])
     return {
-        "cases": [_case(one) for one in replays],
+        "cases": cases,
         "colours": COLOURS,
         "legend": [(kind, colour) for kind, colour in COLOURS.items() if kind in met],
     }
-
-
-def _case(replay: Replay) -> dict:
-    how = looks([drive.row for drive in replay.drives])
-    body = dataclasses.asdict(replay)
-    for drive in body["drives"]:
-        drive["look"] = dataclasses.asdict(how[drive["row"]])
-    return body
 
 
 def write_replay_page(path: Path, replay: Replay, facts: dict[str, object]) -> Path:
@@ -113,7 +110,10 @@ def case_lines(
     first = np.lexsort((progress, nuplan, ~fault, ~is_played))[:MOST]
     lines = []
     for at in first.tolist():
-        drives = [_drive(runs_, at) for runs_ in (mine, theirs)]
+        drives = [
+            jax.tree.map(lambda x, at=at: np.asarray(x)[at], driven)
+            for driven in (mine, theirs)
+        ]
         words = [", ".join(broken_bounds(drive)) for drive in drives]
         place = played.get(runs.ids[at])
         lines.append(
@@ -132,11 +132,6 @@ def case_lines(
             )
         )
     return lines
-
-
-def _drive(metrics: CaseMetrics, at: int) -> CaseMetrics:
-    """Return one case's numbers."""
-    return jax.tree.map(lambda x: np.asarray(x)[at], metrics)
 
 
 def thumbnail(replay: Replay) -> Markup:

@@ -144,12 +144,21 @@ def thin(
     steps = np.arange(FRAME_STEPS - 1, last + FRAME_STEPS, FRAME_STEPS)
     steps = np.minimum(steps, last)  # the end is a frame
     events, start = _events(case, record, last)
-    follows = row == RECORDED_HUMAN
     short = (last + 1) * STEP_S < float(case.steps) * STEP_S - 1e-6
     red = np.asarray(shot.line_red, bool) & (case.lines.kind != LineKind.NONE)
+    gap = float(metrics.min_clearance)
+    near = f"closest {max(gap, 0.0):.1f} m" if np.isfinite(gap) else "nobody near"
+    broken = _broken_words(metrics)
+    plans: list[list[float]] = []  # while they last
+    for step in () if row == RECORDED_HUMAN else steps:
+        now = (step + 1) * STEP_S
+        ahead = now + PLAN_AHEAD_S - plan_start(record, shot, int(step))
+        ahead = ahead[ahead <= TIMES_S[-1]]
+        stations = np.interp(ahead, TIMES_S, shot.plan_s[step])
+        plans.append(_rounded(stations - record.s[step], 1))
     return ReplayedDrive(
         row=row,
-        summary=_summary(metrics),
+        summary=f"{float(metrics.progress):.0f} m driven, {near}, {broken}",
         events=events,
         start=start,
         end="ended by an at-fault collision" if short else "",
@@ -163,7 +172,7 @@ def thin(
             round(float(x), 1) if np.isfinite(x) else None
             for x in record.clearance[steps]
         ],
-        plan=[[] if follows else _plan(record, shot, int(step)) for step in steps],
+        plan=plans or [[] for _ in steps],
         red=[np.flatnonzero(red[step]).tolist() for step in steps],
         agents=[_agents(case, record, shot, int(step)) for step in steps],
     )
@@ -171,15 +180,6 @@ def thin(
 
 def _rounded(values: ArrayLike, digits: int) -> list[float]:
     return np.round(np.asarray(values, np.float64), digits).tolist()
-
-
-def _plan(record: Record, shot: Snapshot, step: int) -> list[float]:
-    """Return stations of the plan in force, beyond the ego's, while it lasts."""
-    now = (step + 1) * STEP_S
-    ahead = now + PLAN_AHEAD_S - plan_start(record, shot, step)
-    ahead = ahead[ahead <= TIMES_S[-1]]
-    stations = np.interp(ahead, TIMES_S, shot.plan_s[step])
-    return _rounded(stations - record.s[step], 1)
 
 
 def _agents(case: Case, record: Record, shot: Snapshot, step: int) -> list[float]:
@@ -278,13 +278,6 @@ def _broken_words(found: CaseMetrics) -> str:
 def goes_as(drive: ReplayedDrive, found: CaseMetrics) -> bool:
     """Return whether a drive breaks the bounds that `found` breaks."""
     return drive.summary.endswith(f", {_broken_words(found)}")
-
-
-def _summary(found: CaseMetrics) -> str:
-    """Return the drive's own numbers in one line."""
-    gap = float(found.min_clearance)
-    near = f"closest {max(gap, 0.0):.1f} m" if np.isfinite(gap) else "nobody near"
-    return f"{float(found.progress):.0f} m driven, {near}, {_broken_words(found)}"
 
 
 def _apart(drives: Sequence[ReplayedDrive]) -> float | None:

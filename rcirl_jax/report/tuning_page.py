@@ -116,14 +116,25 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
     suite, workdir = report.suite.report(), report.workdir
     reward = next(iter(report.rewards.values()))
     sampler = SamplerConfig(mode=str(reward.provenance.get("mode", "speed")))
+    quality = ""
+    if isinstance(report.dataset, Dataset):
+        quality = format_quality(report.dataset.manifest.quality)
     shown = [entry for entry in CONTENTS if workdir or entry[0] != "training"]
+    margins = [
+        (name.replace("_", " "), f"{100.0 * value:g} %")
+        for name, value in report.gate.margins.items()
+    ]
     verdict, rows = report.verdict, (next(iter(suite.rows)), report.incumbent)
     sections: dict[str, Callable[[], object]] = {
         "cards": lambda: cards(verdict, suite, report.incumbent),
         "cases": lambda: case_lines(report.suite, report.incumbent, report.replays),
         "replays": lambda: player_data(report.replays),
         "checks": lambda: checks_tables(verdict),
-        "margins": lambda: margins_table(report.gate),
+        "margins": lambda: Table(
+            caption="Margins, declared before",
+            heads=("", ""),
+            rows=[*margins, ("primary metrics", ", ".join(report.gate.primary))],
+        ),
         "families": lambda: families_tables(verdict),
         "suite": lambda: suite_view(suite, rows),
         "ranking": lambda: ranking_view(report.ranking),
@@ -137,7 +148,7 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
         "training": lambda: _drawn(
             lambda to: draw_training(workdir, to) if workdir else []
         ),
-        "data": lambda: _data(report.dataset),
+        "data": lambda: {"quality": quality, "hash": report.dataset.hash},
         "sweep": lambda: _sweep(report.sweep),
         "provenance": lambda: _provenance(report),
     }
@@ -170,6 +181,9 @@ def cards(
 ) -> list[dict[str, object]]:
     """Return five cards: cases, nearer to the human, safety, comfort, progress."""
     new = len(verdict.new_faults)
+    mine, theirs = next(iter(suite.rows.values())), suite.rows[incumbent]
+    outcomes = {c.outcome for c in verdict.checks if c.kind == "safety"}
+    more = mine.at_fault > theirs.at_fault and outcomes == {"pass"}
     return [
         {
             "title": "Cases driven",
@@ -178,7 +192,16 @@ def cards(
             "kind": DECISIONS[verdict.decision],
         },
         _amount(verdict, "Nearer to the human", ("likeness",), "on held-out drives"),
-        _safety_card(verdict, suite, incumbent),
+        {
+            "title": "Safety",
+            "value": f"{mine.at_fault} / {theirs.at_fault}",
+            "words": "at-fault collisions, candidate / incumbent; red lights "
+            f"{mine.red_lights} / {theirs.red_lights}, stop signs {mine.stop_signs} / "
+            f"{theirs.stop_signs}{'; no more than the margin allows' if more else ''}",
+            "kind": next(
+                (SAFETY[x] for x in ("fail", "open") if x in outcomes), "ship"
+            ),
+        },
         _amount(
             verdict,
             "Comfort",
@@ -222,23 +245,6 @@ def _amount(
     }
 
 
-def _safety_card(
-    verdict: Verdict, suite: SuiteReport, incumbent: str
-) -> dict[str, object]:
-    mine = next(iter(suite.rows.values()))
-    theirs = suite.rows[incumbent]
-    outcomes = {c.outcome for c in verdict.checks if c.kind == "safety"}
-    more = mine.at_fault > theirs.at_fault and outcomes == {"pass"}
-    return {
-        "title": "Safety",
-        "value": f"{mine.at_fault} / {theirs.at_fault}",
-        "words": "at-fault collisions, candidate / incumbent; red lights "
-        f"{mine.red_lights} / {theirs.red_lights}, stop signs {mine.stop_signs} / "
-        f"{theirs.stop_signs}{'; no more than the margin allows' if more else ''}",
-        "kind": next((SAFETY[x] for x in ("fail", "open") if x in outcomes), "ship"),
-    }
-
-
 def checks_tables(verdict: Verdict) -> list[Table]:
     """Return checks over all cases, a forest plot for each kind."""
     tables = []
@@ -247,16 +253,6 @@ def checks_tables(verdict: Verdict) -> list[Table]:
         if checks:
             tables.append(forest(TITLES[kind], checks, [c.title for c in checks]))
     return tables
-
-
-def margins_table(gate: GateConfig) -> Table:
-    """Return what counts as no loss."""
-    margins = [
-        (name.replace("_", " "), f"{100.0 * value:g} %")
-        for name, value in gate.margins.items()
-    ]
-    rows = [*margins, ("primary metrics", ", ".join(gate.primary))]
-    return Table(caption="Margins, declared before", heads=("", ""), rows=rows)
 
 
 def forest(title: str, checks: Sequence[Check], names: Sequence[str]) -> Table:
@@ -287,7 +283,12 @@ def forest(title: str, checks: Sequence[Check], names: Sequence[str]) -> Table:
             failed=kind == "fail",
             words=f"{name}: {numbers}, {word}",
         )
-        rows.append((name, cell, numbers, _evidence(check), said))
+        # the margin, cases that only one of them passes, and the p value
+        margin = "" if check.margin is None else f"−{100.0 * check.margin:g} %"
+        pairs = "" if check.lost is None else f"+{check.gained} −{check.lost}"
+        p = "" if check.p is None else _p(check.p)
+        rest = ", ".join(filter(None, (margin, pairs, p)))
+        rows.append((name, cell, numbers, rest, said))
     heads = ("", "", f"difference [{LEVEL}]", "margin, cases, p", "")
     return Table(caption=title, heads=heads, rows=rows, kind="forest", marked=failing)
 
@@ -300,14 +301,6 @@ def outcome_of(check: Check) -> tuple[str, str]:
         return "better", "pass"
     worse = check.difference < 0.0 and (check.p or 0.0) < SIGNIFICANT
     return ("worse", "open") if worse else ("no difference", "open")
-
-
-def _evidence(check: Check) -> str:
-    """Return the margin, cases that only one of them passes, and the p value."""
-    margin = "" if check.margin is None else f"−{100.0 * check.margin:g} %"
-    pairs = "" if check.lost is None else f"+{check.gained} −{check.lost}"
-    p = "" if check.p is None else _p(check.p)
-    return ", ".join(filter(None, (margin, pairs, p)))
 
 
 def _p(p: float) -> str:
@@ -491,12 +484,6 @@ def _gamma(rewards: Mapping[str, Reward]) -> dict:
         "curves": time_curves("gamma", times, rows, caption),
         "table": Table(caption=caption, heads=("t, s", *rows), rows=cells),
     }
-
-
-def _data(dataset: Demonstrations) -> dict:
-    whole = isinstance(dataset, Dataset)
-    quality = format_quality(dataset.manifest.quality) if whole else ""
-    return {"quality": quality, "hash": dataset.hash}
 
 
 def _sweep(sweep: Mapping | None) -> dict | None:
