@@ -9,8 +9,18 @@ from rcirl_jax.errors import InputError
 MAX_BYTES = 16 * 1024**2  # bytes of a TOML file
 MAX_PARTS = 32  # of a dotted key; the parser's time and memory grow with their square
 MAX_DEPTH = 100  # levels of tables and arrays
-PART = r"""(?:(?<![\w-])[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+"""
-LONG_KEY = re.compile(f"(?:{PART}){{{MAX_PARTS}}}")
+# strings and comments, also those that do not end
+TEXTS = re.compile(
+    r"""
+    "{3} (?: [^"\\]++ | \\.? | "(?!"") )*+ (?: "{3,5}+ )?
+    | '{3} (?: [^']++ | '(?!'') )*+ (?: '{3,5}+ )?
+    | " (?: [^"\\\n]++ | \\[^\n]? )*+ "?
+    | ' [^'\n]*+ '?
+    | \# [^\n]*+
+    """,
+    re.DOTALL | re.VERBOSE,
+)
+LONG_KEY = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MAX_PARTS}}}")
 
 
 def spec_root() -> Path:
@@ -34,8 +44,9 @@ def load_toml(path: Path) -> dict:
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: {error}: expected a readable file") from error
     text = text.replace("\r\n", "\n").replace("\r", "\n")
-    if found := LONG_KEY.search(text):
-        line = text.count("\n", 0, found.start()) + 1
+    plain = TEXTS.sub(lambda found: "_" + "\n" * found[0].count("\n"), text)
+    if found := LONG_KEY.search(plain):
+        line = plain.count("\n", 0, found.start()) + 1
         raise InputError(
             f"{path}: line {line}: {found[0][:40]}...: "
             f"expected at most {MAX_PARTS} parts in a key"

@@ -5,6 +5,7 @@ loss -> gradient -> optimiser. Shards carry (sum, count) and divide once after `
 a mean of shard means is wrong when shards hold different numbers of pairs.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -19,6 +20,7 @@ from rcirl_jax.reward import (
     LossInputs,
     LossSums,
     Normaliser,
+    RewardConfig,
     RewardModel,
     RewardParams,
     init_params,
@@ -52,6 +54,15 @@ class StepMetrics(flax.struct.PyTreeNode, kw_only=True):
     finite: jax.Array  # [] bool: features, loss and gradient are; else nothing changed
 
 
+@functools.lru_cache(maxsize=16)
+def apply_of(config: RewardConfig) -> Apply:
+    """Returns `apply` of a configuration's module.
+
+    One object for each configuration: `jax.jit` compiles again for another one.
+    """
+    return RewardModel(config).apply
+
+
 def init_state(
     config: TrainConfig, normaliser: Normaliser, seed: ArrayLike | None = None
 ) -> TrainState:
@@ -64,7 +75,7 @@ def init_state(
     if config.loss == "gan":
         params["offset"] = jnp.zeros(())
     made = TrainState.create(
-        apply_fn=RewardModel(config.reward).apply,
+        apply_fn=apply_of(config.reward),
         params=params,
         tx=make_optimizer(config.for_step),
         key=train_key,

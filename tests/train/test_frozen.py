@@ -25,8 +25,10 @@ def test_freezing_equals_featurising():
     made = freeze(rows(), np.arange(16), CONFIG)
     assert made.candidates.shape[0] == 16
     again = freeze(jax.tree.map(lambda x: x[4:7], rows()), np.arange(4, 7), CONFIG)
+    times = again.candidates.shape[2]  # those valid in none of the three are cut off
+    assert not made.time_valid[4:7, times:].any()
     np.testing.assert_allclose(
-        again.candidates, made.candidates[4:7], rtol=1e-5, atol=1e-4
+        again.candidates, made.candidates[4:7, :, :times], rtol=1e-5, atol=1e-4
     )
     names = feature_map(CONFIG.features).names
     place = [names.index("station"), names.index("l")]
