@@ -18,8 +18,13 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.export.from_run import read_config
 from rcirl_jax.export.loading import reward_params
 from rcirl_jax.export.reader import Reward
-from rcirl_jax.reward import Normaliser, RewardModel, RewardParams, effective_model
-from rcirl_jax.reward.network import scene_values
+from rcirl_jax.reward import (
+    Normaliser,
+    RewardModel,
+    RewardParams,
+    effective_model,
+    value,
+)
 from rcirl_jax.runtime.atomic_files import write_whole
 from rcirl_jax.train.loop import restore_run
 
@@ -57,8 +62,9 @@ def exported_module(
     """V of a module with K left open, for CPUs and NVIDIA GPUs."""
 
     def program(features: jax.Array, valid: jax.Array) -> jax.Array:
-        x = features.transpose(2, 1, 0)
-        return scene_values(model, params, normaliser, valid, x)[0]
+        # each trajectory with its own gates, as the readers of a file value it
+        masks = jnp.broadcast_to(valid, features.shape[:2])
+        return value(model, params, normaliser, features, masks)
 
     (count,) = jax.export.symbolic_shape("k")
     shape = (count, model.times, normaliser.scale.shape[0])
