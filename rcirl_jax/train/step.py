@@ -7,7 +7,7 @@ a mean of shard means is wrong when shards hold different numbers of pairs.
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import flax.struct
 import jax
@@ -60,7 +60,7 @@ def apply_of(config: RewardConfig) -> Apply:
 
     One object for each configuration: `jax.jit` compiles again for another one.
     """
-    return RewardModel(config).apply
+    return cast(Apply, RewardModel(config).apply)
 
 
 def init_state(
