@@ -10,7 +10,9 @@ import math
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from rcirl_jax.geometry.frenet import lookup
 from rcirl_jax.geometry.polynomial import hermite
 from rcirl_jax.types import Trajectory
 from rcirl_jax.units import DT_S, NUM_TIMES, TIMES_S
@@ -101,9 +103,13 @@ def command(plan: Plan, v: jax.Array) -> jax.Array:
     at = jnp.clip(plan.since / DT_S, 0.0, NUM_TIMES - 2.0)
     here = at.astype(jnp.int32)
     led = jnp.clip((plan.since + LEAD_S) / DT_S, 0.0, NUM_TIMES - 1.0)
-    wanted = jnp.interp(led, jnp.arange(NUM_TIMES), plan.a)
-    wanted = jnp.where(plan.urgent, plan.a[here + 1], wanted)
-    begin, way = plan.v[here], plan.s[here + 1] - plan.s[here]
+    wanted = lookup(plan.a, led, 1.0)
+    planned = jnp.stack([plan.s, plan.v, plan.a])
+    (s, begin, _), (s_next, _, a_next) = jnp.moveaxis(
+        planned[:, here + np.arange(2)], 1, 0
+    )
+    wanted = jnp.where(plan.urgent, a_next, wanted)
+    way = s_next - s
     rests = way < 0.5 * begin * DT_S
     stopping = -(begin**2) / (2.0 * jnp.maximum(way, MIN_WAY_M))
     eased = jnp.maximum(stopping, -(EASED_MPS2 + v / EASING_S))
@@ -124,17 +130,13 @@ def stations_from_now(plan: Plan) -> jax.Array:
     Cubic Hermite interpolation between the planned times; after the plan's end its
     last speed is kept.
     """
-
-    def at(t: jax.Array) -> jax.Array:
-        place = jnp.clip(t / DT_S, 0.0, NUM_TIMES - 1.0)
-        low = jnp.minimum(place.astype(jnp.int32), NUM_TIMES - 2)
-        inside = hermite(
-            place - low,
-            plan.s[low],
-            plan.s[low + 1],
-            (plan.v[low], plan.v[low + 1]),
-            DT_S,
-        )
-        return inside + jnp.maximum(t - TIMES_S[-1], 0.0) * plan.v[-1]
-
-    return at(plan.since + jnp.asarray(TIMES_S)) - at(plan.since)
+    times = jnp.asarray(TIMES_S)
+    t = plan.since + jnp.append(times, 0.0)
+    place = jnp.clip(t / DT_S, 0.0, NUM_TIMES - 1.0)
+    low = jnp.minimum(place.astype(jnp.int32), NUM_TIMES - 2)
+    (s, s_next), (v, v_next) = jnp.moveaxis(
+        jnp.stack([plan.s, plan.v])[:, low[:, None] + np.arange(2)], 2, 1
+    )
+    inside = hermite(place - low, s, s_next, (v, v_next), DT_S)
+    stations = inside + jnp.maximum(t - TIMES_S[-1], 0.0) * plan.v[-1]
+    return stations[:-1] - stations[-1]

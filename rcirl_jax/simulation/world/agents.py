@@ -15,6 +15,7 @@ crosswalks need no maps of conflicts.
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rcirl_jax.geometry.frenet import lookup
 from rcirl_jax.simulation.cases import (
@@ -209,23 +210,26 @@ def mobil(
     # how hard j would have to brake for i, and j's room ahead with and without i
     behind = _ratio_behind(case, bodies, state, pairs)
     own_ahead = jnp.where(in_own & pairs.ahead, ratio, 0.0)
-    best_target, best_gain = state.l_target, driver.threshold
-    now = -jnp.max(own_ahead, axis=1)
     old = jnp.where(in_own & ~pairs.ahead & same_way, behind, 0.0)
-    freed = jnp.max(old, axis=1)
-    for side in (1.0, -1.0):
-        exists = jnp.where(
-            side > 0.0, lane + 1.0 <= road.lanes_left, lane - 1.0 >= -road.lanes_right
-        )
-        there = pairs.other & (jnp.abs(pairs.across - side * width) < half_widths)
-        ahead = jnp.where(there & pairs.ahead, ratio, 0.0)
-        follower = jnp.where(there & ~pairs.ahead & same_way, behind, 0.0)
-        imposed = jnp.max(follower, axis=1)
-        room = jnp.min(jnp.where(there, pairs.gap, jnp.inf), axis=1)
+    sides = np.array([1.0, -1.0])[:, None, None]  # left before right
+    there = pairs.other & (jnp.abs(pairs.across - sides * width) < half_widths)
+    ahead = jnp.where(there & pairs.ahead, ratio, 0.0)
+    follower = jnp.where(there & ~pairs.ahead & same_way, behind, 0.0)
+    near = jnp.where(there, -pairs.gap, -jnp.inf)
+    found = jnp.concatenate([own_ahead[None], old[None], ahead, follower, near])
+    found = jnp.max(found, axis=2)  # [8, A]
+    now, freed = -found[0], found[1]
+    best_target, best_gain = state.l_target, driver.threshold
+    for side, strongest, imposed, room in zip(
+        (1.0, -1.0), found[2:4], found[4:6], -found[6:], strict=True
+    ):
+        exists = lane + 1.0 <= road.lanes_left
+        if side < 0.0:
+            exists = lane - 1.0 >= -road.lanes_right
         gain = driver.acceleration * (
-            -jnp.max(ahead, axis=1) - now + driver.politeness * (freed - imposed)
+            -strongest - now + driver.politeness * (freed - imposed)
         )
-        braking = driver.acceleration * (jnp.max(ahead, axis=1) + share - 1.0)
+        braking = driver.acceleration * (strongest + share - 1.0)
         safe = (
             (driver.acceleration * imposed < SAFE_BRAKING_MPS2)
             & (braking < SAFE_BRAKING_MPS2)

@@ -32,25 +32,20 @@ def road_limit(road: Road) -> jax.Array:
     return planning_limit(road.kappa, road.path_l, road.speed_limit, ROAD_STEP_M, jnp)
 
 
-def remember(seen: Seen, state: AgentState) -> Seen:
-    """History with the present state in front."""
-    now = Seen(
-        s=state.s,
-        l=state.l,
-        heading=state.heading,
-        v=state.v,
-        a=state.a,
-        present=state.present,
-    )
-    push = lambda old, new: jnp.concatenate([new[None], old[:-1]])  # noqa: E731
-    return jax.tree.map(push, seen, now)
+SEEN = ("s", "l", "heading", "v", "a", "present")  # rows of `World.seen`
+
+
+def visible(state: AgentState) -> jax.Array:
+    """What can be seen of the agents, rows [6, A] in the order of `SEEN`."""
+    return jnp.stack([getattr(state, name).astype(jnp.float32) for name in SEEN])
 
 
 def perceive(case: Case, world: World) -> Seen:
     """Leaves [A]: delayed, noisy, with dropouts, as `case.perception` says."""
     noise = case.perception
     age = jnp.round(noise.latency / STEP_S).astype(jnp.int32)
-    late = jax.tree.map(lambda x: x[jnp.clip(age, 0, NUM_HISTORY - 1)], world.seen)
+    late = world.seen[jnp.clip(age, 0, NUM_HISTORY - 1)]
+    late = Seen(**dict(zip(SEEN, late, strict=True)))
     key = jax.random.fold_in(jax.random.key(case.seed), world.step)
     draw = jax.random.normal(key, (3, NUM_AGENTS))
     # a Gaussian below its quantile is a dropout: no second draw is needed
@@ -59,7 +54,7 @@ def perceive(case: Case, world: World) -> Seen:
         s=late.s + noise.sigma_position * draw[0],
         l=late.l + 0.5 * noise.sigma_position * draw[1],
         v=jnp.maximum(late.v * (1.0 + noise.sigma_speed * draw[0]), 0.0),
-        present=late.present & ~lost,
+        present=(late.present > 0.0) & ~lost,
     )
 
 

@@ -17,14 +17,13 @@ from rcirl_jax.simulation.cases import (
     LineKind,
     Record,
     Replay,
-    Seen,
     World,
 )
 from rcirl_jax.simulation.world import agents as others
 from rcirl_jax.simulation.world import judge
 from rcirl_jax.simulation.world import lines as signals
-from rcirl_jax.simulation.world.observe import remember
-from rcirl_jax.simulation.world.vehicle import Vehicle, drive, path_point
+from rcirl_jax.simulation.world.observe import visible
+from rcirl_jax.simulation.world.vehicle import Vehicle, drive, path_points
 from rcirl_jax.types import Kind
 
 DEPARTURE_M = 2.0  # m from its own log beyond which replayed agents turn reactive
@@ -35,7 +34,7 @@ def start(case: Case) -> World:
     """The world at t = 0: the ego on its path, in its heading and curvature."""
     zero = jnp.zeros((NUM_AGENTS,))
     no = jnp.zeros((NUM_AGENTS,), bool)
-    l, slope, curvature = path_point(case.road, jnp.zeros(()))
+    l, slope, curvature, _ = (x[0] for x in path_points(case.road, jnp.zeros((1,))))
     kappa = case.road.kappa[0]
     ego = EgoState(
         s=jnp.zeros(()),
@@ -62,19 +61,11 @@ def start(case: Case) -> World:
     state = others.come_and_go(case, ego, state, step)
     if case.replay is not None:
         state = _from_log(case, case.replay, state, step)
-    fresh = Seen(
-        s=state.s,
-        l=state.l,
-        heading=state.heading,
-        v=state.v,
-        a=state.a,
-        present=state.present,
-    )
     return World(
         step=step,
         ego=ego,
         agents=state,
-        seen=jax.tree.map(lambda x: jnp.stack([x] * NUM_HISTORY), fresh),
+        seen=jnp.stack([visible(state)] * NUM_HISTORY),
         served=jnp.zeros((NUM_LINES,), bool),
         halts=jnp.zeros((NUM_LINES,), bool),
         stopped=jnp.zeros((), bool),
@@ -199,7 +190,7 @@ def step(
         step=world.step + 1,
         ego=moved_ego,
         agents=state,
-        seen=remember(world.seen, state),
+        seen=jnp.concatenate([visible(state)[None], world.seen[:-1]]),
         served=served,
         halts=halts,
         stopped=over | crash,

@@ -46,15 +46,25 @@ def _at(table: jax.Array, s: jax.Array) -> jax.Array:
     return lookup(table, s, ROAD_STEP_M)
 
 
-def path_point(road: Road, s: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Offset l, slope dl/ds and curvature 1/m of the given path at a station."""
+def path_points(
+    road: Road, s: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """The given path at stations [M].
+
+    Returns:
+      Offset l m, slope dl/ds, curvature 1/m of the path, and kappa 1/m of the
+      reference line there; all [M].
+    """
     step = 2.0 * ROAD_STEP_M
-    behind, here, ahead = (_at(road.path_l, s + d) for d in (-step, 0.0, step))
+    around = jnp.stack([s - step, s, s + step])
+    at = jax.vmap(jax.vmap(lookup, (None, 0, None)), (None, 0, None))
+    behind, here, ahead = at(road.path_l, around, ROAD_STEP_M)
+    kappas = at(road.kappa, around, ROAD_STEP_M)
     slope = (ahead - behind) / (2.0 * step)
     bend = (ahead - 2.0 * here + behind) / step**2
-    dkappa = (_at(road.kappa, s + step) - _at(road.kappa, s - step)) / (2.0 * step)
-    kappa = path_curvature(_at(road.kappa, s), dkappa, here, slope, bend)
-    return here, slope, kappa
+    dkappa = (kappas[2] - kappas[0]) / (2.0 * step)
+    curvature = jax.vmap(path_curvature)(kappas[1], dkappa, here, slope, bend)
+    return here, slope, curvature, kappas[1]
 
 
 def steering(ego: EgoState, road: Road, vehicle: Vehicle) -> jax.Array:
@@ -65,10 +75,10 @@ def steering(ego: EgoState, road: Road, vehicle: Vehicle) -> jax.Array:
     so that the lateral error e obeys e'' + 2 z e' / D + e / D^2 = 0 by station.
     """
     ahead = ego.s + ego.v * (vehicle.steering_lag + 0.5 * STEP_S)
-    _, _, feedforward = path_point(road, ahead)
-    l_path, slope, _ = path_point(road, ego.s)
+    l, slopes, curvatures, kappas = path_points(road, jnp.stack([ahead, ego.s]))
+    feedforward, l_path, slope = curvatures[0], l[1], slopes[1]
     reach = jnp.maximum(vehicle.tracking_time * ego.v, vehicle.tracking_min_length)
-    shrink = jnp.maximum(1.0 - _at(road.kappa, ego.s) * ego.l, 0.1)
+    shrink = jnp.maximum(1.0 - kappas[1] * ego.l, 0.1)
     off_heading = ego.heading - jnp.arctan(slope / shrink)
     command = (
         feedforward
