@@ -23,11 +23,9 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.plan import Plan, command, later, no_plan, stations_from_now
+from rcirl_jax.simulation.agents import colours
 from rcirl_jax.simulation.cases import STEP_S, Case, Record, Snapshot, World
-from rcirl_jax.simulation.world import lines as signals
-from rcirl_jax.simulation.world.observe import observe, road_limit
-from rcirl_jax.simulation.world.step import start, step
-from rcirl_jax.simulation.world.vehicle import Vehicle
+from rcirl_jax.simulation.world import Vehicle, observe, road_limit, start, step
 from rcirl_jax.types import Scene
 
 Params = Any  # a policy's weights: any pytree
@@ -148,7 +146,7 @@ def _build_up(command: jax.Array, a: jax.Array, config: RolloutConfig) -> jax.Ar
 
 def _snapshot(case: Case, now: World, after: World, plan: Plan) -> Snapshot:
     time = after.step * STEP_S
-    _, red = signals.colours(case.lines, time)
+    _, red = colours(case.lines, time)
     sign = ~after.served & (case.lines.kind == 2)
     return Snapshot(
         agents=after.agents,

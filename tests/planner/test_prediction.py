@@ -15,7 +15,7 @@ from rcirl_jax.planner.prediction import (
     select_future,
     with_predicted_futures,
 )
-from rcirl_jax.simulation.recorded.scenes import case_of
+from rcirl_jax.simulation.recorded import case_of
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
 from rcirl_jax.types import Kind
 from rcirl_jax.units import DT_S, TIMES_S
