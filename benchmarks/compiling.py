@@ -38,9 +38,7 @@ from rcirl_jax.simulation import rollout
 from rcirl_jax.simulation.metrics import MetricsConfig, case_metrics
 from rcirl_jax.simulation.rollout import LANES, RolloutConfig
 from rcirl_jax.simulation.suite import build, suite_refs
-from rcirl_jax.simulation.world.observe import observe, road_limit
-from rcirl_jax.simulation.world.step import start, step
-from rcirl_jax.simulation.world.vehicle import Vehicle
+from rcirl_jax.simulation.world import Vehicle, observe, road_limit, start, step
 
 STEPS = 200  # of a closed-loop program
 

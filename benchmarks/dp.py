@@ -19,8 +19,7 @@ from absl import app, flags
 from benchmarks.common import percentiles, untrained, write
 from rcirl_jax.export.loading import open_reward, reward_params
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.dp import plan_dp
-from rcirl_jax.planner.grid import DpConfig, Weights
+from rcirl_jax.planner.dp import DpConfig, Weights, plan_dp
 from rcirl_jax.planner.rank import ONLINE, Score, learned_score
 from rcirl_jax.planner.safety import check
 from rcirl_jax.reward import RewardConfig

@@ -26,7 +26,7 @@ from rcirl_jax.report.style import (
     save,
 )
 from rcirl_jax.sampling import sample
-from rcirl_jax.simulation.catalogue.build import family_names
+from rcirl_jax.simulation.catalogue import family_names
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import baseline_row
 from rcirl_jax.simulation.suite import CaseRef, build, case_ref, catalogue_set

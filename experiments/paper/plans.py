@@ -1,7 +1,7 @@
 """Optimality and robustness of a planner, in the paper's terms, over many scenes.
 
 Optimality: the value of the chosen plan against that of the best one that a finer
-solver finds (`planner.optimality`). Robustness: the variance of the plan where the
+solver finds (`planner.dp`). Robustness: the variance of the plan where the
 same scene is seen with other errors, M times,
 
     delta s ~ N(0, sigma_s^2), delta l ~ N(0, sigma_l^2) per body (all times),
@@ -20,8 +20,7 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.statistics import combine_seeds
 from rcirl_jax.features import FeatureMap
-from rcirl_jax.planner.grid import DpConfig, Weights
-from rcirl_jax.planner.optimality import optimality_gap
+from rcirl_jax.planner.dp import DpConfig, Weights, optimality_gap
 from rcirl_jax.planner.plan import Plan, command
 from rcirl_jax.planner.rank import Policy
 from rcirl_jax.sampling.kinematics import trajectory_on_path

@@ -29,9 +29,7 @@ from rcirl_jax.cli.running import provenance, run
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.loading import open_reward, reward_params
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.dp import dp_policy
-from rcirl_jax.planner.grid import DpConfig
-from rcirl_jax.planner.optimality import FINE
+from rcirl_jax.planner.dp import FINE, DpConfig, dp_policy
 from rcirl_jax.planner.rank import (
     Policy,
     RankConfig,

@@ -32,7 +32,7 @@ from rcirl_jax.evaluation.closed_loop.suite import (
 from rcirl_jax.export.closed_loop import SuiteJob, drive_by, read_tuned_idm
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
-from rcirl_jax.simulation.recorded.scenes import held_out
+from rcirl_jax.simulation.recorded import held_out
 from rcirl_jax.simulation.rows import BASELINES, human_row
 from rcirl_jax.simulation.suite import case_duration, recorded_set, suite_refs
 

@@ -35,16 +35,16 @@ from rcirl_jax.export.loading import (
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
-from rcirl_jax.planner.dp import dp_policy
-from rcirl_jax.planner.grid import DpConfig
-from rcirl_jax.planner.prior_cost import WithPriorCost, prior_cost_score
+from rcirl_jax.planner.dp import DpConfig, dp_policy
 from rcirl_jax.planner.rank import (
     Params,
     RankConfig,
     Score,
+    WithPriorCost,
     hand_score,
     idm_policy,
     learned_score,
+    prior_cost_score,
     rank_policy,
 )
 from rcirl_jax.planner.safety import SafetyConfig
@@ -56,6 +56,7 @@ from rcirl_jax.simulation.rollout import LANES
 from rcirl_jax.simulation.rows import (
     Row,
     baseline_row,
+    judges,
 )
 from rcirl_jax.simulation.suite import (
     CaseRef,
@@ -64,7 +65,6 @@ from rcirl_jax.simulation.suite import (
     drive_row,
     rollout_config,
 )
-from rcirl_jax.simulation.world.careful import judges
 
 DP_EVERY = 10  # steps between two plans of the DP row: it costs 1,000 rankings
 FIELDS = tuple(field.name for field in dataclasses.fields(Idm))

@@ -22,7 +22,7 @@ from rcirl_jax.export.closed_loop import SuiteJob, run_job
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.simulation.cases import STEP_S
-from rcirl_jax.simulation.recorded.scenes import held_out
+from rcirl_jax.simulation.recorded import held_out
 from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.simulation.suite import FULL_S, CaseRef, case_duration, suite_refs
 

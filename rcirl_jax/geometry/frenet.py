@@ -87,8 +87,8 @@ def lookup(
     position = jnp.clip(s / step, 0.0, table.shape[0] - 1.0)
     low = jnp.minimum(position.astype(jnp.int32), table.shape[0] - 2)
     share = position - low
-    start = entry(table, low)
-    return start + share * (entry(table, low + 1) - start)
+    start, end = entry(table, low + np.arange(2))
+    return start + share * (end - start)
 
 
 def _curve(line: ReferenceLine, s: jax.Array) -> tuple:

@@ -2,16 +2,26 @@
 
 They produce one trajectory each; every candidate is then valued by how close
 it comes to that trajectory, so that all metrics are defined for them too.
+
+A driver model that follows, stops and gives way: IDM with gap acceptance.
+
+It stands in for a human where demonstrations are made rather than recorded,
+and is a baseline row of its own. Along the path it is an IDM; a body that
+crosses becomes a wall at its near edge while the ego would arrive within the
+time gap that the driver keeps (gap acceptance, HCM 2010 ch. 19).
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
 from rcirl_jax.geometry.frenet import lookup
+from rcirl_jax.planner.plan import Plan, held
 from rcirl_jax.sampling.kinematics import trajectory_from_positions, trajectory_on_path
-from rcirl_jax.types import Kind, Scene, Trajectory
+from rcirl_jax.types import Kind, Obstacles, Scene, Trajectory
 from rcirl_jax.units import DT_S, NUM_TIMES, STATION_STEP_M, TIMES_S
 
 SUBSTEPS = 5  # integration steps of the IDM between two times (0.094 s)
@@ -109,3 +119,130 @@ def closeness(trajectory: Trajectory, other: Trajectory, valid: jax.Array) -> ja
     """Minus the mean distance [m] between two trajectories over valid times."""
     apart = jnp.sqrt((trajectory.s - other.s) ** 2 + (trajectory.l - other.l) ** 2)
     return -jnp.sum(jnp.where(valid, apart, 0.0)) / jnp.sum(valid)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Yielding:
+    """Parameters of the driver; hashable."""
+
+    idm: Idm = dataclasses.field(default_factory=Idm)
+    # 1, share of the planner's speed limit that is driven
+    limit_share: float = 0.97
+    # s kept between a crossing body and the ego at the conflict
+    time_gap: float = 1.2
+    # m kept to the near edge of a crossing body
+    distance_gap: float = 2.0
+    # m added to the half widths when the path is searched for bodies
+    margin: float = 0.35
+    # m/s sideways above which a body crosses
+    crossing_speed: float = 0.7
+    # s within which somebody who enters the lane ahead counts as the leader
+    entering: float = 2.5
+
+
+def _in_path(scene: Scene, margin: float) -> jax.Array:
+    """[N, T] bool: the body's box reaches into the strip the ego will drive."""
+    o = scene.obstacles
+    middle = 0.5 * (o.s_lower + o.s_upper)
+    at = jax.vmap(jax.vmap(lookup, (None, 0, None)), (None, 0, None))
+    path_l = at(scene.path.l, middle, STATION_STEP_M)
+    aside = jnp.maximum(o.l_lower - path_l, path_l - o.l_upper)
+    known = o.valid & (o.kind != Kind.NONE)[:, None]
+    return known & (aside < 0.5 * scene.ego.width + margin)
+
+
+def _arrival(scene: Scene, station: jax.Array, limit: jax.Array) -> jax.Array:
+    """Time [s] at which the ego's centre reaches a station at 1 m/s^2, then limit."""
+    way = jnp.maximum(station - scene.ego.s, 0.0)
+    v = jnp.maximum(scene.ego.v, 0.0)
+    rise = jnp.maximum(limit - v, 0.0)
+    ramp_way = v * rise + 0.5 * rise**2
+    inside = -v + jnp.sqrt(v**2 + 2.0 * way)
+    beyond = rise + (way - ramp_way) / jnp.maximum(jnp.maximum(limit, v), 0.5)
+    return jnp.where(way <= ramp_way, inside, beyond)
+
+
+def _walls(
+    scene: Scene, in_path: jax.Array, crosses: jax.Array, driver: Yielding
+) -> jax.Array:
+    """[N] m, gap to the wall that a crossing body raises; inf without one."""
+    o, ego = scene.obstacles, scene.ego
+    limit = scene.path.speed_limit[0]
+    times = jnp.asarray(TIMES_S)
+    enter = jnp.min(jnp.where(in_path, times, jnp.inf), axis=1)
+    leave = jnp.max(jnp.where(in_path, times, -jnp.inf), axis=1) + DT_S
+    near = jnp.min(jnp.where(in_path, o.s_lower, jnp.inf), axis=1)
+    far = jnp.max(jnp.where(in_path, o.s_upper, -jnp.inf), axis=1)
+    reach = 0.5 * ego.length + driver.distance_gap
+    arrive = _arrival(scene, near - reach, limit)
+    clear = _arrival(scene, far + reach, limit)
+    meets = (arrive < leave + driver.time_gap) & (clear > enter - driver.time_gap)
+    gap = near - ego.s - reach
+    # too late to stop for it: go on
+    stoppable = gap > ego.v**2 / (2.0 * 6.0) - driver.distance_gap
+    counts = crosses & jnp.isfinite(enter) & meets & stoppable & (far > ego.s)
+    return jnp.where(counts, jnp.maximum(gap, 0.2), jnp.inf)
+
+
+def _leaders(scene: Scene, in_path: jax.Array, driver: Yielding) -> jax.Array:
+    """[N] bool: bodies and lines ahead in the path, now or soon."""
+    soon = jnp.asarray(TIMES_S) <= driver.entering
+    front = scene.ego.s + 0.5 * scene.ego.length
+    ahead = scene.obstacles.s_lower[:, 0] > front - 0.5
+    return jnp.any(in_path & soon, axis=1) & ahead
+
+
+def acceleration(scene: Scene, driver: Yielding) -> jax.Array:
+    """The driver's acceleration [] m/s^2: the lowest that any reason demands."""
+    o, ego = scene.obstacles, scene.ego
+    in_path = _in_path(scene, driver.margin)
+    sideways = jnp.abs(o.l_lower[:, 1] - o.l_lower[:, 0]) / DT_S
+    is_body = (o.kind >= Kind.VEHICLE) & (o.kind <= Kind.STATIC)
+    crosses = is_body & (sideways > driver.crossing_speed) & ~_drives_along(o)
+    leads = _leaders(scene, in_path, driver) & ~crosses
+    front = ego.s + 0.5 * ego.length
+    gap = jnp.where(leads, o.s_lower[:, 0] - front, 1e3)
+    speed = jnp.where(leads, o.speed[:, 0], ego.v)
+    wall = jnp.minimum(_walls(scene, in_path, crosses, driver), 1e3)
+    standing = wall + driver.idm.standstill_gap
+    desired = driver.limit_share * scene.path.speed_limit[0]
+    respond = jax.vmap(idm_acceleration, (None, 0, 0, None, None))
+    behind = respond(ego.v, gap, ego.v - speed, desired, driver.idm)
+    blocked = respond(
+        ego.v, standing, jnp.where(wall < 1e3, ego.v, 0.0), desired, driver.idm
+    )
+    return jnp.minimum(jnp.min(behind), jnp.min(blocked))
+
+
+def bodies_in_path(scene: Scene, driver: Yielding) -> tuple[jax.Array, jax.Array]:
+    """Gap [N] m (inf if none) and speed [N] m/s along the road of bodies ahead.
+
+    Bodies in the ego's path now or within the driver's `entering` time, and
+    lines that demand a stop.
+    """
+    o = scene.obstacles
+    leads = _leaders(scene, _in_path(scene, driver.margin), driver)
+    gap = o.s_lower[:, 0] - scene.ego.s - 0.5 * scene.ego.length
+    sideways = jnp.abs(o.l_lower[:, 1] - o.l_lower[:, 0]) / DT_S
+    in_way_now = sideways < driver.crossing_speed
+    counts = leads & in_way_now
+    return jnp.where(counts, gap, jnp.inf), jnp.where(counts, o.speed[:, 0], 0.0)
+
+
+def _drives_along(o: Obstacles) -> jax.Array:
+    """[N] bool: moves mainly along the road, with the ego."""
+    sideways = jnp.abs(o.l_lower[:, 1] - o.l_lower[:, 0]) / DT_S
+    return o.speed[:, 0] > 1.5 * sideways
+
+
+@functools.lru_cache(maxsize=16)
+def yielding_policy(driver: Yielding) -> Callable[..., Plan]:
+    """The driver as a policy of the simulator."""
+
+    def policy(
+        params: None, scene: Scene, key: jax.Array, before: Plan | None = None
+    ) -> Plan:
+        del params, key, before
+        return held(scene.ego.v, acceleration(scene, driver))
+
+    return policy

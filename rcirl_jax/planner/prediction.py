@@ -74,7 +74,10 @@ def most_relevant(bodies: Bodies, ego: Ego, path: Path) -> jax.Array:
 def relevant(bodies: Bodies, ego: Ego, path: Path) -> Bodies:
     """The `NUM_BODIES` bodies that matter most."""
     index = most_relevant(bodies, ego, path)
-    return jax.tree.map(lambda x: x[index], bodies)
+    leaves, tree = jax.tree.flatten(bodies)
+    taken = jnp.stack([x.astype(jnp.float32) for x in leaves])[:, index]
+    kinds = zip(taken, leaves, strict=True)
+    return jax.tree.unflatten(tree, [x.astype(old.dtype) for x, old in kinds])
 
 
 def lateral_motion(bodies: Bodies, path: Path) -> tuple[jax.Array, jax.Array]:

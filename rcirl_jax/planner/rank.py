@@ -3,6 +3,16 @@
 Every policy here is a pure function `(params, scene, key, before) -> Plan`; a policy
 differs from another by its score only, so the safety filter, the candidates
 and the tracking are the same for a learned, a hand-set and a random reward.
+
+A learned score added to the planner's own cost, with a gain for each scene.
+
+    V = V_own + gain V_learned
+    gain = low + (high - low) familiarity      familiarity as in `reward.familiarity`
+
+A reward learned on some roads knows little of others. There the gain is `low`, and the
+learned value decides only between plans that the planner's own cost finds nearly equal.
+In traffic like the recorded traffic the gain is `high`. Gains are in units of the own
+cost per unit of V.
 """
 
 import dataclasses
@@ -10,14 +20,15 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 
 from rcirl_jax.features import FeatureMap
 from rcirl_jax.planner.baselines import Idm, idm_acceleration
-from rcirl_jax.planner.commitment import InForce, committed
-from rcirl_jax.planner.plan import Plan, held, plan_of
+from rcirl_jax.planner.plan import Plan, PreviousPlan, committed, held, plan_of
 from rcirl_jax.planner.safety import SafetyConfig, check, choose
+from rcirl_jax.reward.familiarity import Familiarity, familiarity
 from rcirl_jax.reward.hand import LatticeCost, lattice_costs
 from rcirl_jax.reward.network import (
     ACTIVATIONS,
@@ -143,7 +154,9 @@ def speed_dp_score(params: None, scene: Scene, candidates: Candidates) -> jax.Ar
     return -jax.vmap(lambda x: speed_dp_cost(scene, x))(candidates.trajectory)
 
 
-def with_plan_in_force(candidates: Candidates, in_force: InForce | None) -> Candidates:
+def with_plan_in_force(
+    candidates: Candidates, in_force: PreviousPlan | None
+) -> Candidates:
     """The candidates and, last, the rest of the plan in force, if there is one."""
     if in_force is None:
         return candidates
@@ -155,7 +168,7 @@ def best_plan(
     candidates: Candidates,
     scores: jax.Array,
     config: RankConfig,
-    in_force: InForce | None = None,
+    in_force: PreviousPlan | None = None,
 ) -> Plan:
     """The candidate that `safety.choose` takes, as a plan.
 
@@ -198,15 +211,15 @@ def best_plan(
 def rank_policy(score: Score, config: RankConfig) -> Policy:
     """The planner that drives the admissible candidate of the highest score."""
 
-    def anew(
-        params: Params, scene: Scene, key: jax.Array, in_force: InForce | None
+    def replan(
+        params: Params, scene: Scene, key: jax.Array, in_force: PreviousPlan | None
     ) -> Plan:
         sampled = sample(key, scene, config.sampler)
         candidates = with_plan_in_force(sampled, in_force)
         scores = score(params, scene, candidates)
         return best_plan(scene, candidates, scores, config, in_force)
 
-    return committed(anew, config.sampler, config.safety, config.commitment)
+    return committed(replan, config.sampler, config.safety, config.commitment)
 
 
 @functools.lru_cache(maxsize=8)
@@ -246,3 +259,33 @@ def constant_speed_policy(
     """The acceleration stays 0."""
     del params, key, before
     return held(scene.ego.v, jnp.zeros(()))
+
+
+class WithPriorCost(flax.struct.PyTreeNode, kw_only=True):
+    """Weights of a score with a prior cost."""
+
+    reward: RewardParams  # effective
+    normaliser: Normaliser
+    familiarity: Familiarity
+    low: jax.Array  # [] gain where nothing is known
+    high: jax.Array  # [] gain where all is
+    own: Params  # weights of the own cost
+
+
+def gain(params: WithPriorCost, rows: Sequence[jax.Array]) -> jax.Array:
+    """The gain [] of a scene from its candidates' raw features, F of [T, K]."""
+    x0 = jnp.stack([row[0, 0] for row in rows])
+    return params.low + (params.high - params.low) * familiarity(params.familiarity, x0)
+
+
+@functools.lru_cache(maxsize=16)
+def prior_cost_score(features: FeatureMap, activation: str, own: Score) -> Score:
+    """Score of `WithPriorCost`, by the equation of the module."""
+
+    def score(params: WithPriorCost, scene: Scene, candidates: Candidates) -> jax.Array:
+        rows = features.rows(scene, candidates)
+        model = effective_model(params.reward, activation)
+        values = value_rows(model, params.reward, params.normaliser, rows, scene)
+        return own(params.own, scene, candidates) + gain(params, rows) * values
+
+    return score

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.features.path import path_view
+from rcirl_jax.features.columns import path_view
 from rcirl_jax.geometry.boxes import frenet_extent
 from rcirl_jax.types import Candidates, Kind, Scene, Trajectory
 from rcirl_jax.units import DT_S, TIMES_S

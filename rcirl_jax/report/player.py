@@ -13,7 +13,7 @@ from rcirl_jax.evaluation.closed_loop.runs import SuiteRuns
 from rcirl_jax.report.pages import Table, facts_text, part, write_page
 from rcirl_jax.report.replays import Replay, broken_bounds, goes_as
 from rcirl_jax.report.style import CANDIDATE, CLASS_COLOURS, HUMAN_LOOK, LOOKS, Look
-from rcirl_jax.simulation.catalogue.families import family_title
+from rcirl_jax.simulation.families import family_title
 from rcirl_jax.simulation.metrics import nuplan_score
 from rcirl_jax.simulation.rows import RECORDED_HUMAN
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rcirl_jax.features.path import path_view
+from rcirl_jax.features.columns import path_view
 from rcirl_jax.types import Scene, Trajectory
 from rcirl_jax.units import DT_S, NUM_TIMES
 

@@ -17,8 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.features.columns import driven_curvature
-from rcirl_jax.features.path import SLOPE_POINTS, table_slope
+from rcirl_jax.features.columns import SLOPE_POINTS, driven_curvature, table_slope
 from rcirl_jax.geometry.frenet import lookup
 from rcirl_jax.geometry.polynomial import evaluate, quartic, quintic
 from rcirl_jax.sampling.kinematics import (

@@ -206,14 +206,14 @@ class AgentState(flax.struct.PyTreeNode, kw_only=True):
 
 
 class Seen(flax.struct.PyTreeNode, kw_only=True):
-    """What perception remembers of the agents; leaves [H, A], newest first."""
+    """What is perceived of the agents."""
 
-    s: jax.Array  # [H, A] m
-    l: jax.Array  # [H, A] m
-    heading: jax.Array  # [H, A] rad
-    v: jax.Array  # [H, A] m/s
-    a: jax.Array  # [H, A] m/s^2
-    present: jax.Array  # [H, A] bool
+    s: jax.Array  # [A] m
+    l: jax.Array  # [A] m
+    heading: jax.Array  # [A] rad
+    v: jax.Array  # [A] m/s
+    a: jax.Array  # [A] m/s^2
+    present: jax.Array  # [A] bool
 
 
 class World(flax.struct.PyTreeNode, kw_only=True):
@@ -222,7 +222,7 @@ class World(flax.struct.PyTreeNode, kw_only=True):
     step: jax.Array  # [] int32
     ego: EgoState
     agents: AgentState
-    seen: Seen
+    seen: jax.Array  # [H, 6, A] what perception remembers, newest first (`SEEN`)
     served: jax.Array  # [L] bool: the ego has stood at this stop sign
     halts: jax.Array  # [L] bool: this light's yellow or red has demanded a stop
     stopped: jax.Array  # [] bool: an at-fault collision has ended the drive

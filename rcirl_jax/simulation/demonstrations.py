@@ -2,7 +2,7 @@
 
 Recorded roads cover what was recorded. Where a planner also has to nudge past
 parked cars, take tight bends or give way at a roundabout, a reward that has
-never seen these prefers to stand still. Here a driver model (`planner.yielding`)
+never seen these prefers to stand still. Here a driver model (`planner.baselines`)
 drives catalogue cases of ANOTHER seed than the suite's, and its drives become a
 dataset like any import: scenes as the planner sees them online (predicted, not
 recorded futures) with what the driver did in the following 8 s.
@@ -32,8 +32,7 @@ from rcirl_jax.data.store.manifest import Manifest
 from rcirl_jax.data.store.splits import assign_groups
 from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
-from rcirl_jax.planner.baselines import Idm
-from rcirl_jax.planner.yielding import Yielding, yielding_policy
+from rcirl_jax.planner.baselines import Idm, Yielding, yielding_policy
 from rcirl_jax.runtime.compiling import CompilesFirst
 from rcirl_jax.simulation.cases import STEP_S, Case, Record
 from rcirl_jax.simulation.rollout import (

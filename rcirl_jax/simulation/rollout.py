@@ -23,11 +23,9 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.plan import Plan, command, later, no_plan, stations_from_now
+from rcirl_jax.simulation.agents import colours
 from rcirl_jax.simulation.cases import STEP_S, Case, Record, Snapshot, World
-from rcirl_jax.simulation.world import lines as signals
-from rcirl_jax.simulation.world.observe import observe, road_limit
-from rcirl_jax.simulation.world.step import start, step
-from rcirl_jax.simulation.world.vehicle import Vehicle
+from rcirl_jax.simulation.world import Vehicle, observe, road_limit, start, step
 from rcirl_jax.types import Scene
 
 Params = Any  # a policy's weights: any pytree
@@ -78,7 +76,7 @@ def rollout(
     cases: Case,
     config: RolloutConfig,
     takeover_policy: Policy | None = None,
-) -> tuple[Record, Snapshot | None, Scene | None]:
+) -> tuple[jax.Array, Scene | None]:
     """Drive cases [B] from start to end, side by side.
 
     With a `takeover_policy` the two drive in turn, the policy for
@@ -86,8 +84,9 @@ def rollout(
     then the pair of their weights.
 
     Returns:
-      The record [S, B], and where the configuration asks for them the snapshots
-      [S, B] and the planning frames [S / plan_every, B]; time comes first.
+      Record and, where the configuration asks for it, snapshot of every step as
+      `_unpacked` reads them [S, B, L], and the planning frames [S / plan_every, B]
+      where it asks for those; time comes first.
     """
     limits = jax.vmap(lambda case: road_limit(case.road))(cases)
     stream = lambda seed: jax.random.fold_in(jax.random.key(seed), SAMPLER_STREAM)  # noqa: E731
@@ -106,7 +105,7 @@ def rollout(
 
     def tick(
         case: Case, now: World, waiting: jax.Array, plan: Plan
-    ) -> tuple[tuple[World, jax.Array, Plan], tuple[Record, Snapshot | None]]:
+    ) -> tuple[tuple[World, jax.Array, Plan], jax.Array]:
         asked = command(plan, now.ego.v)
         waiting = jnp.concatenate([asked[None], waiting])
         late, waiting = waiting[-1], waiting[:-1]
@@ -115,7 +114,7 @@ def rollout(
             case, now, applied, plan.fallback, config.vehicle, config.follow_log
         )
         shot = _snapshot(case, now, after, plan) if config.snapshots else None
-        return (after, waiting, later(plan, STEP_S)), (record, shot)
+        return (after, waiting, later(plan, STEP_S)), _packed((record, shot))
 
     def plan_and_drive(carry: tuple, _: None) -> tuple[tuple, tuple]:
         worlds, waiting, before = carry
@@ -133,8 +132,7 @@ def rollout(
     begin = (jax.vmap(start)(cases), jnp.zeros((count, config.command_delay)), nothing)
     plans = config.steps // config.plan_every
     _, (logs, scenes) = jax.lax.scan(plan_and_drive, begin, length=plans)
-    flat = lambda x: x.reshape(config.steps, *x.shape[2:])  # noqa: E731
-    return *jax.tree.map(flat, logs), scenes
+    return logs.reshape(config.steps, count, -1), scenes
 
 
 def _build_up(command: jax.Array, a: jax.Array, config: RolloutConfig) -> jax.Array:
@@ -148,13 +146,40 @@ def _build_up(command: jax.Array, a: jax.Array, config: RolloutConfig) -> jax.Ar
 
 def _snapshot(case: Case, now: World, after: World, plan: Plan) -> Snapshot:
     time = after.step * STEP_S
-    _, red = signals.colours(case.lines, time)
+    _, red = colours(case.lines, time)
     sign = ~after.served & (case.lines.kind == 2)
     return Snapshot(
         agents=after.agents,
         plan_s=now.ego.s + stations_from_now(plan),
         line_red=red | sign,
     )
+
+
+def _packed(logs: tuple[Record, Snapshot | None]) -> jax.Array:
+    """The logs of a step as one array [L]: a loop writes it at once."""
+    leaves = [jnp.ravel(x).astype(jnp.float32) for x in jax.tree.leaves(logs)]
+    return jnp.concatenate(leaves)
+
+
+def _unpacked(packed: Any, cases: Case, snapshots: bool) -> tuple:  # noqa: ANN401
+    """Records and snapshots [...] of packed ones [..., L]; numpy's or JAX's."""
+
+    def logged(case: Case) -> tuple[Record, Snapshot | None]:
+        world = start(case)
+        after, record = step(case, world, case.ego_v, case.ego_v > 0.0, Vehicle())
+        shot = _snapshot(case, world, after, no_plan()) if snapshots else None
+        return record, shot
+
+    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), cases)
+    leaves, tree = jax.tree.flatten(jax.eval_shape(logged, one))
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    parts = [
+        packed[..., end - leaf.size : end]
+        .reshape(*packed.shape[:-1], *leaf.shape)
+        .astype(leaf.dtype)
+        for leaf, end in zip(leaves, ends, strict=True)
+    ]
+    return jax.tree.unflatten(tree, parts)
 
 
 @functools.lru_cache(maxsize=32)
@@ -169,7 +194,8 @@ def _compiled(
         logs = rollout(policy, params, cases, config, takeover_policy)
         if reduce is None:
             return logs
-        made = jax.vmap(reduce, in_axes=1)(logs[0])
+        record, _ = _unpacked(logs[0], cases, config.snapshots)
+        made = jax.vmap(reduce, in_axes=1)(record)
         return (made, logs) if keep else made
 
     return jax.jit(run)
@@ -223,10 +249,15 @@ def drive_cases(
         made = jax.block_until_ready(drive(params, part))
         # time comes first in the program: a view, where a program would copy
         by_case = lambda x: np.swapaxes(np.asarray(x), 0, 1)  # noqa: E731
+
+        def kept(logs: tuple) -> Logs:
+            packed, scenes = jax.tree.map(by_case, logs)
+            return *_unpacked(packed, part, config.snapshots), scenes
+
         if reduce is None:
-            return jax.tree.map(by_case, made)
+            return kept(made)
         if keep:
-            return made[0], jax.tree.map(by_case, made[1])
+            return made[0], kept(made[1])
         return made[0] if keeps else made
 
     if not in_groups:

@@ -18,7 +18,7 @@ import numpy as np
 
 from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.simulation.cases import STEP_S, Case, Record, Snapshot
-from rcirl_jax.simulation.catalogue.build import (
+from rcirl_jax.simulation.catalogue import (
     build_cases,
     case_id,
     family_names,
@@ -27,7 +27,7 @@ from rcirl_jax.simulation.catalogue.build import (
     parse_case_id,
 )
 from rcirl_jax.simulation.metrics import CaseMetrics, MetricsConfig, case_metrics
-from rcirl_jax.simulation.recorded.scenes import DATASET, HeldOut
+from rcirl_jax.simulation.recorded import DATASET, HeldOut
 from rcirl_jax.simulation.rollout import LANES, RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import Row
 from rcirl_jax.units import HORIZON_S

@@ -25,7 +25,7 @@ from rcirl_jax.geometry.frenet import ReferenceLine, project_lanes
 from rcirl_jax.planner.plan import Plan, command, later, no_plan, stations_from_now
 from rcirl_jax.planner.rank import Policy
 from rcirl_jax.simulation.rows import Row
-from rcirl_jax.simulation.world.vehicle import Vehicle
+from rcirl_jax.simulation.world import Vehicle
 from rcirl_jax.simulators.measures import EpisodeLog, log_of, sample
 from rcirl_jax.simulators.simulators import STEP_S, Move, Simulator, View
 from rcirl_jax.types import Kind, Scene
@@ -152,7 +152,7 @@ class Next(flax.struct.PyTreeNode, kw_only=True):
 
 
 def follow(plan: Plan, v: jax.Array, a: jax.Array, vehicle: Vehicle) -> Next:
-    """Advance 0.1 s along a plan by the drive train of `simulation.world.vehicle`.
+    """Advance 0.1 s along a plan by the drive train of `simulation.world`.
 
     Args:
       plan: in force.

@@ -16,7 +16,7 @@ from rcirl_jax.export.own_planner.inputs import Body, Car
 from rcirl_jax.geometry.boxes import Box, separation
 from rcirl_jax.simulation.cases import Record
 from rcirl_jax.simulation.metrics import CaseMetrics, MetricsConfig, case_metrics
-from rcirl_jax.simulation.world.judge import STOPPED_EGO_MPS
+from rcirl_jax.simulation.world import STOPPED_EGO_MPS
 from rcirl_jax.simulators.simulators import STEP_S, View
 
 LENGTHS = 100  # steps: records are filled up to a multiple, so that few compile

@@ -32,7 +32,7 @@ import sumo
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.own_planner.inputs import Body, Car, Signal
-from rcirl_jax.simulation.world.lines import can_stop
+from rcirl_jax.simulation.agents import can_stop
 from rcirl_jax.simulators.simulators import (
     STEP_S,
     Move,

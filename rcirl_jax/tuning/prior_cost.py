@@ -1,4 +1,4 @@
-"""The learned value on top of the planner's own cost; see `planner.prior_cost`.
+"""The learned value on top of the planner's own cost; see `planner.rank`.
 
 The familiarity is fitted on recorded scenes against scenes of the catalogue, and
 stands in the weights file with the gains, so that a planner adds its own cost and

@@ -39,7 +39,7 @@ from rcirl_jax.report.replays import Replay, make_replays
 from rcirl_jax.runtime.atomic_files import read_json, write_json, write_whole
 from rcirl_jax.runtime.pipeline import digest, file_sha256
 from rcirl_jax.sampling import SamplerConfig
-from rcirl_jax.simulation.recorded.scenes import held_out
+from rcirl_jax.simulation.recorded import held_out
 from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
 from rcirl_jax.simulation.suite import recorded_set
 from rcirl_jax.train.loop import train

@@ -12,8 +12,7 @@ from rcirl_jax.export.own_planner.builder import scene_from
 from rcirl_jax.export.own_planner.inputs import Body, Car, CentreLine, Signal
 from rcirl_jax.export.own_planner.plain import plain_scene
 from rcirl_jax.simulation.cases import LineKind
-from rcirl_jax.simulation.world.observe import observe, road_limit
-from rcirl_jax.simulation.world.step import start
+from rcirl_jax.simulation.world import observe, road_limit, start
 from rcirl_jax.types import Kind
 from rcirl_jax.units import TIMES_S
 from tests.helpers.own_planner import entries

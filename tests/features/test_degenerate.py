@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rcirl_jax.features import feature_map
-from rcirl_jax.features.relations import relate, slots
+from rcirl_jax.features.columns import relate, slots
 from rcirl_jax.planner.rank import hand_score, learned_score
 from rcirl_jax.reward import LOSSES, RewardConfig, effective_params, init_params
 from rcirl_jax.sampling import SamplerConfig, trajectory_on_path

@@ -5,14 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.planner.commitment import only_where
-from rcirl_jax.planner.plan import later, no_plan
+from rcirl_jax.planner.plan import later, no_plan, only_where
 from rcirl_jax.planner.rank import RankConfig, hand_score, rank_policy
 from tests.helpers.scenes import random_scene
 
 
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])
-def test_only_lanes_that_need_it_are_made_anew(backend, monkeypatch):
+def test_only_lanes_that_need_it_are_made_again(backend, monkeypatch):
     """One by one on a CPU, all at once elsewhere."""
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     needed = jnp.asarray([True, False, True, False, False])

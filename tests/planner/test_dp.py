@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.dp import plan_dp
-from rcirl_jax.planner.grid import DpConfig
+from rcirl_jax.planner.dp import DpConfig, plan_dp
 from rcirl_jax.planner.rank import learned_score
 from rcirl_jax.reward import RewardConfig, effective_params, init_params
 from rcirl_jax.sampling.kinematics import trajectory_on_path

@@ -14,7 +14,7 @@ from experiments.paper.plans import (
     steadiness,
     summary,
 )
-from rcirl_jax.planner.optimality import emergency_stop, optimality_gap
+from rcirl_jax.planner.dp import emergency_stop, optimality_gap
 from rcirl_jax.planner.rank import (
     ONLINE,
     RankConfig,

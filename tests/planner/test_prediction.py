@@ -15,7 +15,7 @@ from rcirl_jax.planner.prediction import (
     select_future,
     with_predicted_futures,
 )
-from rcirl_jax.simulation.recorded.scenes import case_of
+from rcirl_jax.simulation.recorded import case_of
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
 from rcirl_jax.types import Kind
 from rcirl_jax.units import DT_S, TIMES_S
@@ -94,6 +94,26 @@ def test_a_follower_slows_down_behind_its_leader_and_keeps_its_headway():
     # alone it would be where the leader is
     alone, _, _ = PREDICT(bodies({"s": 0.0, "speed": 15.0}), made.ego, made.path)
     assert float(alone[0, -1]) == pytest.approx(120.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("gap", [4.0, 10.0, 40.0])
+def test_a_follower_keeps_the_headway_it_has_now(gap):
+    """The IDM with T = clip((gap - 2) / v, 0.4, 1.5), integrated here in float64."""
+    made = scene(v=0.0, l=-30.0)  # its limit: 25 m/s
+    pair = bodies({"speed": 10.0}, {"s": gap + 4.6, "speed": 10.0})
+    s, _, v = PREDICT(pair, made.ego, made.path)
+    headway = np.clip((gap - 2.0) / 10.0, 0.4, 1.5)
+    station, speed = 0.0, 10.0
+    for k, time in enumerate(TIMES_S.astype(float)):
+        assert float(s[0, k]) == pytest.approx(station, abs=2e-3)
+        assert float(v[0, k]) == pytest.approx(speed, abs=2e-3)
+        room = gap + 10.0 * time - station
+        closing = speed * (speed - 10.0) / (2.0 * np.sqrt(1.0 * 2.0))
+        wanted = 2.0 + max(speed * headway + closing, 0.0)
+        idm = 1.0 - (speed / 20.0) ** 4 - (wanted / room) ** 2
+        a = (1.0 - np.exp(-time / 2.0)) * np.clip(idm, -8.0, 1.0)
+        station += 0.5 * DT_S * (speed + max(speed + a * DT_S, 0.0))
+        speed = max(speed + a * DT_S, 0.0)
 
 
 def test_the_most_relevant_bodies_come_first():

@@ -27,7 +27,7 @@ from rcirl_jax.planner.rank import (
     rank_policy,
     velocity_score,
 )
-from rcirl_jax.reward import RewardConfig, value
+from rcirl_jax.reward import RewardConfig, RewardModel, value
 from rcirl_jax.types import Kind
 from tests.helpers.scenes import random_scene, sampled
 from tests.planner.test_dp import weights
@@ -61,9 +61,9 @@ def test_scores_are_the_reward_of_training():
     candidates = sampled(jax.random.key(0), made, ONLINE)
     params, norm = weights()
     mask = jnp.broadcast_to(made.time_valid, (64, 18))
-    shape = RewardConfig(pin="none")
+    model = RewardModel(RewardConfig(pin="none"))
     expected = value(
-        params, norm, FEATURES.of_candidates(made, candidates), mask, shape
+        model, params, norm, FEATURES.of_candidates(made, candidates), mask
     )
     np.testing.assert_allclose(
         SCORE((params, norm), made, candidates), expected, rtol=1e-5, atol=1e-5

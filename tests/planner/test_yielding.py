@@ -4,8 +4,13 @@ import jax
 import numpy as np
 import pytest
 
-from rcirl_jax.planner.baselines import Idm, idm_acceleration
-from rcirl_jax.planner.yielding import Yielding, acceleration, bodies_in_path
+from rcirl_jax.planner.baselines import (
+    Idm,
+    Yielding,
+    acceleration,
+    bodies_in_path,
+    idm_acceleration,
+)
 from rcirl_jax.types import Kind
 from rcirl_jax.units import TIMES_S
 from tests.helpers.scenes import scene

@@ -11,7 +11,7 @@ from rcirl_jax.report.replays import AHEAD_M, BEHIND_M, FRAME_STEPS, make_replay
 from rcirl_jax.simulation import rollout
 from rcirl_jax.simulation import suite as suite_module
 from rcirl_jax.simulation.cases import STEP_S
-from rcirl_jax.simulation.recorded.scenes import held_out
+from rcirl_jax.simulation.recorded import held_out
 from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.suite import (
     drive_row,

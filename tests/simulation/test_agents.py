@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rcirl_jax.simulation.world.agents import MAX_BRAKING_MPS2
+from rcirl_jax.simulation.agents import MAX_BRAKING_MPS2
 from rcirl_jax.types import Kind
 from tests.simulation.drives import drive
 from tests.simulation.worlds import make_case

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.simulation.world.careful import (
+from rcirl_jax.simulation.rows import (
     Careful,
     cc_braking,
     fsm_braking,

@@ -9,7 +9,7 @@ import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.simulation.cases import LineKind
-from rcirl_jax.simulation.catalogue.build import (
+from rcirl_jax.simulation.catalogue import (
     build_case,
     build_cases,
     case_id,
@@ -18,7 +18,7 @@ from rcirl_jax.simulation.catalogue.build import (
     parameters_of,
     parse_case_id,
 )
-from rcirl_jax.simulation.catalogue.expressions import Expression
+from rcirl_jax.simulation.families import Expression
 from rcirl_jax.simulation.suite import SMOKE_S, CaseRef, build, case_ref, suite_refs
 
 SMALL = """
@@ -153,7 +153,7 @@ def test_a_case_depends_on_its_name_only():
 
 HASHED = """
 import hashlib, jax, numpy as np
-from rcirl_jax.simulation.catalogue.build import build_case, load_family
+from rcirl_jax.simulation.catalogue import build_case, load_family
 total = hashlib.sha256()
 for name in ("cut_in", "compound_city"):
     for leaf in jax.tree.leaves(build_case(load_family(name), 3)):

@@ -12,10 +12,8 @@ from hypothesis import strategies as st
 from rcirl_jax.geometry.boxes import Box, contact_interval
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.rank import idm_policy
-from rcirl_jax.simulation.world import judge
-from rcirl_jax.simulation.world.agents import come_and_go
-from rcirl_jax.simulation.world.lines import halting
-from rcirl_jax.simulation.world.step import start
+from rcirl_jax.simulation.agents import spawn_and_despawn, stopping_for_light
+from rcirl_jax.simulation.world import contacts, off_road, start
 from rcirl_jax.types import Kind
 from tests.simulation.drives import drive
 from tests.simulation.worlds import make_case
@@ -25,8 +23,8 @@ from tests.simulation.worlds import make_case
 def judged(case, ego_l, ego_v, heading):
     world = start(case)
     ego = world.ego.replace(l=ego_l, v=ego_v, heading=heading)
-    state = come_and_go(case, ego, world.agents, world.step)
-    return judge.contacts(case, ego, state), judge.off_road(case, ego)
+    state = spawn_and_despawn(case, ego, world.agents, world.step)
+    return contacts(case, ego, state), off_road(case, ego)
 
 
 def at(agent, ego_v=10.0, ego_l=0.0, heading=0.0, kappa=0.0, lanes=(1, 1)):
@@ -144,7 +142,9 @@ def test_a_light_that_has_demanded_a_stop_does_so_until_it_is_green():
     def halts(before, time, distance):
         asked = jnp.asarray([before] + [False] * (lines.s.size - 1))
         return bool(
-            halting(lines, asked, jnp.asarray(time), distance - 0 * lines.s, v)[0]
+            stopping_for_light(
+                lines, asked, jnp.asarray(time), distance - 0 * lines.s, v
+            )[0]
         )
 
     assert not halts(False, 10.0, 60.0)  # green

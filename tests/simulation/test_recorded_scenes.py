@@ -17,7 +17,7 @@ from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.plan import held
 from rcirl_jax.planner.prediction import with_predicted_futures
 from rcirl_jax.planner.rank import idm_policy
-from rcirl_jax.simulation.recorded.scenes import (
+from rcirl_jax.simulation.recorded import (
     CLOCK_S,
     STEPS,
     case_of,

@@ -17,7 +17,7 @@ from rcirl_jax.simulation.cases import (
     ROAD_STEP_M,
     Case,
 )
-from rcirl_jax.simulation.catalogue.build import build_cases, family_names, load_family
+from rcirl_jax.simulation.catalogue import build_cases, family_names, load_family
 from rcirl_jax.types import Kind
 
 ROOT = pathlib.Path(__file__).parents[2]

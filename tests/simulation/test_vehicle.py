@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from rcirl_jax.simulation.cases import NUM_ROAD, ROAD_STEP_M, EgoState
-from rcirl_jax.simulation.world.vehicle import Vehicle, drive, steering
+from rcirl_jax.simulation.world import Vehicle, drive, steering
 from tests.simulation.worlds import make_case
 
 

@@ -11,7 +11,7 @@ from rcirl_jax.features import feature_map
 from rcirl_jax.planner.plan import held
 from rcirl_jax.planner.rank import RankConfig
 from rcirl_jax.simulation.rows import Row, baseline_row
-from rcirl_jax.simulation.world.vehicle import Vehicle
+from rcirl_jax.simulation.world import Vehicle
 from rcirl_jax.simulators.drive import Seen, drive, follow
 from rcirl_jax.simulators.measures import measure
 from rcirl_jax.simulators.simulators import open_simulator

@@ -36,8 +36,8 @@ from rcirl_jax.features import mapping
 from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.runtime.pipeline import Stages
 from rcirl_jax.runtime.specs import spec_root
-from rcirl_jax.simulation.catalogue import families
-from rcirl_jax.simulation.catalogue.build import build_case
+from rcirl_jax.simulation import families
+from rcirl_jax.simulation.catalogue import build_case
 from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.train import checkpoint
 from rcirl_jax.train.loop import check_run, describe_run

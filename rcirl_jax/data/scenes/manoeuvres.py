@@ -45,7 +45,7 @@ OWN_MOVE_M = 0.5  # m sideways, at least, of who comes; position noise is less
 NUDGE_MOVE_M = 0.4  # m, beyond what drivers drift in their lane
 NUDGE_WITHIN_S = 4.0  # s before being abreast
 NUDGE_CLEARANCE_M = 1.2  # m; two cars in the middle of 3.5 m lanes leave 1.7 m
-NUDGE_RANGE_M = 3.0  # m, as in features.relations
+NUDGE_RANGE_M = 3.0  # m, as in features.columns
 NUDGE_SPEED_MPS = 2.0  # m/s faster than the obstacle to pass it
 # cut-in: near as seen from the human (UN R157 looks at 60 m at 130 km/h: 1.7 s)
 CUT_IN_S, CUT_IN_M = 3.0, 5.0  # s of the human's speed and m to the bumper

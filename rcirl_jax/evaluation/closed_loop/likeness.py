@@ -1,6 +1,6 @@
 """How near a driver stays to the human, in closed loop on held-out recordings.
 
-Every row drives the same D short cases (`simulation.recorded.scenes`) from the human's
+Every row drives the same D short cases (`simulation.recorded`) from the human's
 own state along the human's own path. The number that the gate reads is
 
     distance = mean over the recorded 10 Hz times of |s_row(t) - s_human(t)|    [m]
@@ -39,7 +39,7 @@ from rcirl_jax.evaluation.statistics import (
 )
 from rcirl_jax.runtime.executors import two_at_a_time
 from rcirl_jax.simulation.cases import STEP_S, Record
-from rcirl_jax.simulation.recorded.scenes import STEPS, HeldOut
+from rcirl_jax.simulation.recorded import STEPS, HeldOut
 from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, human_row
 from rcirl_jax.simulation.suite import rollout_config
@@ -233,7 +233,7 @@ def held_out_likeness(
     """Drive every row, and the recorded human, over the held-out drives.
 
     Args:
-      drives: of `simulation.recorded.scenes.held_out`.
+      drives: of `simulation.recorded.held_out`.
       rows: learned rows, baselines; names are distinct.
       plan_every: steps of 0.1 s between two plans, of rows that need no other.
 

@@ -23,9 +23,8 @@ from rcirl_jax.runtime.compiling import CompilesFirst
 from rcirl_jax.runtime.executors import two_at_a_time
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.metrics import CaseMetrics
-from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row
+from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, judges, preventable, trivial
 from rcirl_jax.simulation.suite import CaseSet, drive_row, rollout_config
-from rcirl_jax.simulation.world.careful import judges, preventable, trivial
 
 # s of driving in all cases below which compiling takes longer than driving: then rows
 # drive two at a time, so that one compiles while the other drives

@@ -127,7 +127,7 @@ def summarise(
     Args:
       runs: metrics [C] by row; the first is compared with the others.
       families: [C] family of every case.
-      preventable: [C] bool, of `simulation.world.careful`.
+      preventable: [C] bool, of `simulation.rows`.
       trivial: [C] bool.
       reference_name: the row that sets the distance.
       way: [C] m, how far it got.

@@ -53,7 +53,7 @@ from rcirl_jax.evaluation.statistics import (
     tango,
     within_strata,
 )
-from rcirl_jax.simulation.catalogue.families import family_title
+from rcirl_jax.simulation.families import family_title
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 
 MIN_CLUSTERS = 5  # families or vehicles below which no interval over them is made

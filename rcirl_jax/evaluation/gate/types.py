@@ -118,7 +118,7 @@ class Pair:
     families: Sequence[str]
     ids: Sequence[str]
     reference: np.ndarray  # [C] m, way of the driver that nuPlan's score compares to
-    preventable: np.ndarray  # [C] bool, `simulation.world.careful.preventable`
+    preventable: np.ndarray  # [C] bool, `simulation.rows.preventable`
     name: str = INCUMBENT  # of the incumbent
     trivial_baselines: Mapping[str, CaseMetrics] = dataclasses.field(
         default_factory=dict

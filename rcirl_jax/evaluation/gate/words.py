@@ -7,7 +7,7 @@ import numpy as np
 
 from rcirl_jax.evaluation.closed_loop.summary import text_table
 from rcirl_jax.evaluation.gate.types import INCUMBENT, Check, NewFault, Pair, Verdict
-from rcirl_jax.simulation.catalogue.families import family_title
+from rcirl_jax.simulation.families import family_title
 
 WIDTH = 100  # columns of wrapped text
 MAX_LINES = 3  # of the sentence, in these columns

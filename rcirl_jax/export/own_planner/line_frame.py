@@ -32,7 +32,7 @@ from rcirl_jax.geometry.frenet import (
 )
 from rcirl_jax.geometry.limits import LOOK_AHEAD_M, planning_limit
 from rcirl_jax.planner.prediction import Bodies
-from rcirl_jax.simulation.world.lines import can_stop
+from rcirl_jax.simulation.agents import can_stop
 from rcirl_jax.types import Ego, Kind, Path
 from rcirl_jax.units import HORIZON_S, NUM_STATIONS, STATION_STEP_M
 

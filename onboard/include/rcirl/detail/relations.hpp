@@ -1,5 +1,5 @@
 // Where each obstacle stands relative to 32 candidates at one time; see
-// `rcirl_jax/features/relations.py` and docs/features.md for the classes.
+// `rcirl_jax/features/columns.py` and docs/features.md for the classes.
 //
 //   gap         = max(s_lower - (s + L/2), (s - L/2) - s_upper)
 //   lateral gap = max(l_lower - (l + W/2), (l - W/2) - l_upper)

@@ -4,19 +4,321 @@ The format is described in docs/scenarios.md. Unknown keys are errors, so that
 a misspelt one does not silently keep its default.
 """
 
+import ast
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
+import numpy as np
 
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.runtime.specs import load_toml, spec_root
-from rcirl_jax.simulation.cases import NUM_MOVES, NUM_PHASES
-from rcirl_jax.simulation.catalogue.expressions import Expression
+from rcirl_jax.simulation.cases import (
+    NUM_AGENTS,
+    NUM_LINES,
+    NUM_MOVES,
+    NUM_PHASES,
+    NUM_ROAD,
+    ROAD_STEP_M,
+    Agents,
+    Driver,
+    Lines,
+    Road,
+    Script,
+    node,
+)
+from rcirl_jax.types import Kind
+
+STATIONS = np.arange(NUM_ROAD) * ROAD_STEP_M  # m, the road grid
+
+
+@dataclasses.dataclass
+class Parts:
+    """The elements of all events of a case, joined."""
+
+    kappa: np.ndarray
+    limits: list[tuple[float, float]]
+    shifts: list[tuple[float, float, float]]
+    lines: list[dict[str, float]]
+    agents: list[dict]
+
+
+def road_of(road: dict[str, float], parts: Parts) -> Road:
+    """The road grid: curvature, limits and the given path along it."""
+    limit = np.full(NUM_ROAD, road["speed_limit"])
+    for at, speed in sorted(parts.limits):
+        limit[at <= STATIONS] = speed
+    path = np.zeros(NUM_ROAD)
+    for at, length, target in sorted(parts.shifts):
+        begin = float(np.interp(at, STATIONS, path))
+        u = np.clip((STATIONS - at) / max(length, ROAD_STEP_M), 0.0, 1.0)
+        smooth = u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+        path = np.where(at <= STATIONS, begin + (target - begin) * smooth, path)
+    width = road["lane_width"]
+    f = np.float32
+    return node(
+        Road,
+        kappa=parts.kappa.astype(f),
+        speed_limit=limit.astype(f),
+        path_l=path.astype(f),
+        lane_width=f(width),
+        lanes_left=np.int32(road["lanes_left"]),
+        lanes_right=np.int32(road["lanes_right"]),
+        edge_left=f(
+            (road["lanes_left"] + road["oncoming"] + 0.5) * width + road["shoulder"]
+        ),
+        edge_right=f(-((road["lanes_right"] + 0.5) * width + road["shoulder"])),
+        destination=f(road["destination"]),
+    )
+
+
+def lines_of(parts: Parts) -> Lines:
+    """Lights and stop signs; empty slots have kind NONE."""
+    names = {"s": "at", "offset": "offset", "green": "green", "yellow": "yellow"}
+    names["red"] = "red"
+    made = {}
+    for leaf, key in names.items():
+        made[leaf] = np.zeros(NUM_LINES, np.float32)
+        made[leaf][: len(parts.lines)] = [line[key] for line in parts.lines]
+    kind = np.zeros(NUM_LINES, np.int32)
+    kind[: len(parts.lines)] = [int(line["kind"]) for line in parts.lines]
+    return node(Lines, kind=kind, **made)
+
+
+def _column(rows: list[dict], name: str, empty: float) -> np.ndarray:
+    out = np.full(NUM_AGENTS, empty, np.float32)
+    out[: len(rows)] = [row[name] for row in rows]
+    return out
+
+
+def agents_of(rows: list[dict]) -> Agents:
+    """Agents with their drivers and scripts; empty slots have kind NONE."""
+    flags = {name: np.zeros(NUM_AGENTS, bool) for name in FLAGS}
+    for name, values in flags.items():
+        values[: len(rows)] = [row[name] for row in rows]
+    kind = np.full(NUM_AGENTS, Kind.NONE, np.int32)
+    kind[: len(rows)] = [row["kind"] for row in rows]
+    neutral = {"headway": 1.4, "standstill": 2.0, "acceleration": 1.4, "braking": 2.0}
+    neutral |= {"desired": 10.0, "lapse_start": np.inf, "lapse_end": np.inf}
+    plain = ("s", "l", "heading", "v", "v_share", "appear_t")
+    return node(
+        Agents,
+        kind=kind,
+        length=_column(rows, "length", 1.0),
+        width=_column(rows, "width", 1.0),
+        appear_s=_column(rows, "appear_s", np.inf),
+        arrival_s=_column(rows, "arrival_s", np.inf),
+        relative=flags.pop("relative"),
+        **{name: _column(rows, name, 0.0) for name in plain},
+        driver=node(
+            Driver,
+            **flags,
+            **{name: _column(rows, name, neutral.get(name, 0.0)) for name in DRIVER},
+        ),
+        script=_script(rows),
+    )
+
+
+def _script(rows: list[dict]) -> Script:
+    f = np.float32
+    start = np.full((NUM_AGENTS, NUM_PHASES), np.inf, f)
+    speed, rate = np.zeros_like(start), np.ones_like(start)
+    move_start = np.full((NUM_AGENTS, NUM_MOVES), np.inf, f)
+    move_l, move_speed = np.zeros_like(move_start), np.ones_like(move_start)
+    for i, row in enumerate(rows):
+        for p, phase in enumerate(row["phases"]):
+            start[i, p], speed[i, p], rate[i, p] = phase
+        for m, move in enumerate(row["moves"]):
+            move_start[i, m], move_l[i, m], move_speed[i, m] = move
+    return node(
+        Script,
+        start=start,
+        speed=speed,
+        rate=rate,
+        move_start=move_start,
+        move_l=move_l,
+        move_speed=move_speed,
+    )
+
+
+MAX_LENGTH = 400  # characters of an expression
+MAX_EXPONENT = 64.0  # largest |exponent| of a power
+
+CONSTANTS = {"pi": math.pi, "inf": math.inf, "true": 1.0, "false": 0.0}
+
+
+def _clip(x: float, low: float, high: float) -> float:
+    return min(max(x, low), high)
+
+
+def _where(condition: float, yes: float, no: float) -> float:
+    return yes if condition else no
+
+
+def _power(base: float, exponent: float) -> float:
+    if abs(exponent) > MAX_EXPONENT:
+        raise ValueError(f"exponent {exponent:g}: expected at most {MAX_EXPONENT:g}")
+    return float(base) ** exponent
+
+
+# name -> (function, fewest and most arguments)
+FUNCTIONS: dict[str, tuple[Callable, int, int]] = {
+    "min": (min, 2, 8),
+    "max": (max, 2, 8),
+    "abs": (abs, 1, 1),
+    "sqrt": (math.sqrt, 1, 1),
+    "sin": (math.sin, 1, 1),
+    "cos": (math.cos, 1, 1),
+    "tan": (math.tan, 1, 1),
+    "atan": (math.atan, 1, 1),
+    "exp": (math.exp, 1, 1),
+    "log": (math.log, 1, 1),
+    "floor": (math.floor, 1, 1),
+    "round": (round, 1, 1),
+    "clip": (_clip, 3, 3),
+    "where": (_where, 3, 3),
+}
+
+_ALLOWED = (
+    ast.Expression,
+    ast.BinOp,
+    ast.UnaryOp,
+    ast.BoolOp,
+    ast.Compare,
+    ast.Call,
+    ast.Name,
+    ast.Load,
+    ast.Constant,
+    ast.Add,
+    ast.Sub,
+    ast.Mult,
+    ast.Div,
+    ast.FloorDiv,
+    ast.Mod,
+    ast.Pow,
+    ast.UAdd,
+    ast.USub,
+    ast.Not,
+    ast.And,
+    ast.Or,
+    ast.Lt,
+    ast.LtE,
+    ast.Gt,
+    ast.GtE,
+    ast.Eq,
+    ast.NotEq,
+)
+
+
+class _Bound(ast.NodeTransformer):
+    """Powers become calls of the bounded power."""
+
+    def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
+        """Replace `a ** b`."""
+        self.generic_visit(node)
+        if not isinstance(node.op, ast.Pow):
+            return node
+        name = ast.Name(id="_power", ctx=ast.Load())
+        return ast.Call(func=name, args=[node.left, node.right], keywords=[])
+
+
+def _number_text(number: float) -> str:
+    try:
+        return repr(float(number)) if math.isfinite(number) else "inf"
+    except OverflowError:
+        return "inf"
+
+
+class Expression:
+    """One checked expression; calling it with variables gives a float."""
+
+    def __init__(self, text: str | float | bool, where: str) -> None:
+        """Check and compile.
+
+        Args:
+          text: the expression, or a plain number.
+          where: "FILE: field", for messages.
+
+        Raises:
+          InputError: not arithmetic, or something that is not allowed.
+        """
+        self.text, self.where = str(text), where
+        if isinstance(text, bool | int | float):
+            self.text = _number_text(text)
+        if len(self.text) > MAX_LENGTH:
+            raise InputError(f"{where}: {len(self.text)} characters: too long")
+        try:
+            tree = ast.parse(self.text.strip(), mode="eval")
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+            raise InputError(f"{where}: {self.text!r}: not arithmetic") from error
+        self.names = frozenset(self._check(tree))
+        bounded = ast.fix_missing_locations(_Bound().visit(tree))
+        self._code = compile(bounded, "<expression>", "eval")
+
+    def _check(self, tree: ast.Expression) -> list[str]:
+        names: list[str] = []
+        called = {
+            id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)
+        }
+        for part in ast.walk(tree):
+            if not isinstance(part, _ALLOWED):
+                raise self._refuse(type(part).__name__)
+            if isinstance(part, ast.Constant) and not isinstance(
+                part.value, int | float
+            ):
+                raise self._refuse(f"constant {part.value!r}")
+            if isinstance(part, ast.Call):
+                self._check_call(part)
+            elif isinstance(part, ast.Name) and id(part) not in called:
+                names.append(part.id)
+        return names
+
+    def _check_call(self, node: ast.Call) -> None:
+        name = node.func.id if isinstance(node.func, ast.Name) else "?"
+        if name not in FUNCTIONS or node.keywords:
+            raise self._refuse(f"call of {name}")
+        _, fewest, most = FUNCTIONS[name]
+        if not fewest <= len(node.args) <= most:
+            raise self._refuse(f"{name} with {len(node.args)} arguments")
+
+    def _refuse(self, what: str) -> InputError:
+        return InputError(
+            f"{self.where}: {self.text!r}: {what}: expected arithmetic with "
+            f"{', '.join(FUNCTIONS)}"
+        )
+
+    def __call__(self, variables: Mapping[str, float]) -> float:
+        """The value under the variables.
+
+        Raises:
+          InputError: an unknown name, or no finite-or-infinite real number.
+        """
+        try:
+            value = float(eval(self._code, _GLOBALS, {**CONSTANTS, **variables}))
+        except NameError as error:
+            raise InputError(
+                f"{self.where}: {self.text!r}: {error}: expected a parameter or a "
+                "derived value"
+            ) from error
+        except (ArithmeticError, ValueError, TypeError) as error:
+            raise InputError(f"{self.where}: {self.text!r}: {error}") from error
+        if math.isnan(value):
+            raise InputError(f"{self.where}: {self.text!r}: not a number")
+        return value
+
+
+# names an expression can reach: our functions and nothing built in
+_GLOBALS = {
+    "__builtins__": {},
+    "_power": _power,
+    **{name: function for name, (function, _, _) in FUNCTIONS.items()},
+}
+
 
 DISTRIBUTIONS = ("uniform", "normal", "lognormal", "choice")
 KINDS = ("vehicle", "cyclist", "pedestrian", "static")

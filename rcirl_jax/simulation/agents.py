@@ -10,11 +10,16 @@ crosswalks need no maps of conflicts.
         s* = s0 + max(v T + v (v - v_j) / (2 sqrt(a b)), 0)
     MOBIL (Kesting, Treiber, Helbing 2007): change if it is safe and
         a~_e - a_e + p [(a~_n - a_n) + (a~_o - a_o)] > threshold
+
+Before them, the stop lines: what a light shows, and who has to stop.
 """
+
+from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rcirl_jax.geometry.frenet import lookup
 from rcirl_jax.simulation.cases import (
@@ -25,9 +30,89 @@ from rcirl_jax.simulation.cases import (
     AgentState,
     Case,
     EgoState,
+    LineKind,
+    Lines,
+    World,
 )
-from rcirl_jax.simulation.world import lines as signals
 from rcirl_jax.types import Kind
+
+# m/s^2: at yellow one stops if this braking suffices (dilemma-zone practice)
+YELLOW_BRAKING_MPS2 = 3.0
+STOP_WINDOW_M = 5.0  # m before a stop sign within which standing counts (nuPlan)
+STOP_SPEED_MPS = 0.1  # m/s, standing (nuPlan)
+
+
+def colours(lines: Lines, time: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(yellow, red) [L] bool of all lines at a time [s]."""
+    is_light = lines.kind == LineKind.LIGHT
+    cycle = jnp.maximum(lines.green + lines.yellow + lines.red, 1e-3)
+    phase = jnp.mod(time + lines.offset, cycle)
+    yellow = is_light & (phase >= lines.green) & (phase < lines.green + lines.yellow)
+    red = is_light & (phase >= lines.green + lines.yellow)
+    return yellow, red
+
+
+def can_stop(v: Any, distance: Any) -> Any:  # noqa: ANN401
+    """Whether 3 m/s^2 stop a driver at speed v m/s within distance m, elementwise.
+
+    Arguments are numbers or arrays, of numpy or JAX.
+    """
+    return v**2 <= 2.0 * YELLOW_BRAKING_MPS2 * distance
+
+
+def must_stop(
+    lines: Lines, time: jax.Array, distance: jax.Array, v: jax.Array
+) -> jax.Array:
+    """Whether lights demand a stop of a driver: bool, shape of `distance`.
+
+    Red always does; yellow where the driver can still stop with 3 m/s^2.
+
+    Args:
+      lines: [L].
+      time: [] s.
+      distance: [..., L] m from the driver's front to the lines.
+      v: [..., 1] m/s, the driver's speed.
+    """
+    yellow, red = colours(lines, time)
+    return red | (yellow & can_stop(v, jnp.maximum(distance, 0.0)))
+
+
+def stopping_for_light(
+    lines: Lines, halts: jax.Array, time: jax.Array, distance: jax.Array, v: jax.Array
+) -> jax.Array:
+    """Lights [L] that have demanded a stop of the ego and are not green again.
+
+    Who could stop when the light turned yellow has to: without this a driver who
+    brakes late by a little is let go on, and meets red at the line.
+    """
+    yellow, red = colours(lines, time)
+    return (yellow | red) & (halts | must_stop(lines, time, distance, v))
+
+
+def mark_stop_sign_served(
+    lines: Lines, served: jax.Array, distance: jax.Array, v: jax.Array
+) -> jax.Array:
+    """Stop signs at which the ego has stood: within 5 m before it, below 0.1 m/s."""
+    stands = (v < STOP_SPEED_MPS) & (distance >= 0.0) & (distance <= STOP_WINDOW_M)
+    return served | (stands & (lines.kind == LineKind.STOP_SIGN))
+
+
+def stop_line(case: Case, world: World, ego: EgoState) -> jax.Array:
+    """Station [] m of the nearest line that demands a stop of the ego now; inf.
+
+    Args:
+      case: the drive, with its lines.
+      world: its clock, the stop signs at which the ego has stood, the lights that it
+        stops for.
+      ego: whose front is at or before the line.
+    """
+    lines = case.lines
+    distance = lines.s - (ego.s + 0.5 * case.ego_length)
+    time = world.step * STEP_S
+    light = stopping_for_light(lines, world.halts, time, distance, ego.v[None])
+    sign = (lines.kind == LineKind.STOP_SIGN) & ~world.served
+    return jnp.min(jnp.where((light | sign) & (distance >= 0.0), lines.s, jnp.inf))
+
 
 MAX_BRAKING_MPS2 = 8.0  # m/s^2, physical cap of an agent's braking
 IDM_EXPONENT = 4.0  # 1, Treiber et al.
@@ -136,7 +221,7 @@ def _ahead_of_lines(case: Case, state: AgentState, time: jax.Array) -> jax.Array
     agents, lines = case.agents, case.lines
     front = state.s + 0.5 * agents.length
     distance = lines.s[None] - front[:, None]
-    stop = signals.demands(lines, time, distance, state.v[:, None])
+    stop = must_stop(lines, time, distance, state.v[:, None])
     gap = jnp.where(stop & (distance > -1.0), distance, jnp.inf)
     nearest = jnp.maximum(jnp.min(gap, axis=1), 0.0) + agents.driver.standstill - 1.0
     ratio = interaction(
@@ -209,23 +294,26 @@ def mobil(
     # how hard j would have to brake for i, and j's room ahead with and without i
     behind = _ratio_behind(case, bodies, state, pairs)
     own_ahead = jnp.where(in_own & pairs.ahead, ratio, 0.0)
-    best_target, best_gain = state.l_target, driver.threshold
-    now = -jnp.max(own_ahead, axis=1)
     old = jnp.where(in_own & ~pairs.ahead & same_way, behind, 0.0)
-    freed = jnp.max(old, axis=1)
-    for side in (1.0, -1.0):
-        exists = jnp.where(
-            side > 0.0, lane + 1.0 <= road.lanes_left, lane - 1.0 >= -road.lanes_right
-        )
-        there = pairs.other & (jnp.abs(pairs.across - side * width) < half_widths)
-        ahead = jnp.where(there & pairs.ahead, ratio, 0.0)
-        follower = jnp.where(there & ~pairs.ahead & same_way, behind, 0.0)
-        imposed = jnp.max(follower, axis=1)
-        room = jnp.min(jnp.where(there, pairs.gap, jnp.inf), axis=1)
+    sides = np.array([1.0, -1.0])[:, None, None]  # left before right
+    there = pairs.other & (jnp.abs(pairs.across - sides * width) < half_widths)
+    ahead = jnp.where(there & pairs.ahead, ratio, 0.0)
+    follower = jnp.where(there & ~pairs.ahead & same_way, behind, 0.0)
+    near = jnp.where(there, -pairs.gap, -jnp.inf)
+    found = jnp.concatenate([own_ahead[None], old[None], ahead, follower, near])
+    found = jnp.max(found, axis=2)  # [8, A]
+    now, freed = -found[0], found[1]
+    best_target, best_gain = state.l_target, driver.threshold
+    for side, strongest, imposed, room in zip(
+        (1.0, -1.0), found[2:4], found[4:6], -found[6:], strict=True
+    ):
+        exists = lane + 1.0 <= road.lanes_left
+        if side < 0.0:
+            exists = lane - 1.0 >= -road.lanes_right
         gain = driver.acceleration * (
-            -jnp.max(ahead, axis=1) - now + driver.politeness * (freed - imposed)
+            -strongest - now + driver.politeness * (freed - imposed)
         )
-        braking = driver.acceleration * (jnp.max(ahead, axis=1) + share - 1.0)
+        braking = driver.acceleration * (strongest + share - 1.0)
         safe = (
             (driver.acceleration * imposed < SAFE_BRAKING_MPS2)
             & (braking < SAFE_BRAKING_MPS2)
@@ -307,7 +395,7 @@ def steer_targets(agents: Agents, state: AgentState) -> jax.Array:
     return target
 
 
-def come_and_go(
+def spawn_and_despawn(
     case: Case, ego: EgoState, state: AgentState, step: jax.Array
 ) -> AgentState:
     """Agents appear, start their clocks, and leave."""

@@ -34,20 +34,17 @@ from rcirl_jax.simulation.cases import (
     Perception,
     node,
 )
-from rcirl_jax.simulation.catalogue.families import (
+from rcirl_jax.simulation.families import (
+    STATIONS,
     AgentSpec,
     Element,
     Family,
     Parameter,
-    family_names,
-    load_family,
-)
-from rcirl_jax.simulation.catalogue.population import draw_driver
-from rcirl_jax.simulation.catalogue.tables import (
-    STATIONS,
     Parts,
     agents_of,
+    family_names,
     lines_of,
+    load_family,
     road_of,
 )
 from rcirl_jax.types import Kind
@@ -62,6 +59,31 @@ __all__ = [
     "parameters_of",
     "parse_case_id",
 ]
+
+
+def draw_driver(rng: np.random.Generator, speed_limit: float) -> dict[str, float]:
+    """One driver's parameters by the names of `Driver`.
+
+    Uniform draws and inverse distribution functions only, so that the stream
+    is the same under every numpy.
+    """
+    u = np.clip(rng.random(8), 1e-6, 1.0 - 1e-6)
+    share = float(np.clip(1.0 + 0.1 * ndtri(u[0]), 0.7, 1.3))
+    headway = float(np.clip(1.4 * np.exp(0.3 * ndtri(u[1])), 0.6, 3.0))
+    spread = lambda i, low, high: float(low + (high - low) * u[i])  # noqa: E731
+    return {
+        "desired": share * speed_limit,
+        "headway": headway,
+        "standstill": spread(2, 1.0, 4.0),
+        "acceleration": spread(3, 0.8, 2.5),
+        "braking": spread(4, 1.5, 3.5),
+        "delay": spread(5, 0.2, 0.8),
+        "politeness": spread(6, 0.0, 0.5),
+        "threshold": spread(7, 0.1, 0.3),
+        "lapse_start": np.inf,
+        "lapse_end": np.inf,
+    }
+
 
 MAX_EVENTS = 8  # events of a case
 MAX_COPIES = 1000  # of an agent, before `when` chooses

@@ -1,1 +1,0 @@
-"""Stored scenes -> cases: others as recorded, the ego driven by the planner."""
