@@ -182,11 +182,8 @@ def scenes_of(
             raise InputError(f"{recording.name}: {CHANGED}")
         return dataclasses.replace(made, known=True)
     report = QualityReport()
-    if recording.refused:
-        report.add_refusal(recording)
-    elif not recording.tracks:
-        report.add_empty(recording)
     if recording.refused or not recording.tracks:
+        report.add_nothing(recording)
         return dataclasses.replace(made, quality=report.state())
     collector = Collector(recording, config)
     # a few at a time: a row before it is assembled takes more than twice the memory
@@ -236,7 +233,6 @@ class Progress:
       total: files; None: unknown, recordings are counted then.
     """
 
-    NUM_REASONS = 2  # drop reasons shown, the most frequent ones
     FORMAT = "{desc}: {percentage:.0f}% [{elapsed}<{remaining}{postfix}]"
 
     def __init__(self, total: int | None) -> None:
@@ -272,7 +268,7 @@ class Progress:
             self._known = quality.scenes
         seconds = max(time.monotonic() - self._start, 1e-9)
         rate = (quality.scenes - self._known) / seconds
-        reasons = quality.dropped.most_common(self.NUM_REASONS)
+        reasons = quality.dropped.most_common(2)
         dropped = " ".join(f"{name} {count:,}" for name, count in reasons)
         self._bar.set_postfix_str(
             f"{quality.scenes:,} scenes, {rate:.0f}/s"

@@ -48,7 +48,13 @@ def leaving_out(files: Sequence[InputFile]) -> list[InputFile]:
 
 def work_units(files: Sequence[InputFile], workers: int) -> Iterator[WorkUnit]:
     """Yield files, to be read where they are used; of few or long ones, recordings."""
-    dealt = [slice_ for file in files for slice_ in _time_slices(file)]
+    dealt = []
+    for file in files:
+        try:
+            specs = pieces(file.format, file.input, file.spec)
+            dealt += [dataclasses.replace(file, spec=spec) for spec in specs]
+        except InputError:  # cannot be opened: whoever reads it says why
+            dealt.append(file)
     is_few = len(dealt) < workers
     for file in dealt:
         if is_few or is_long(file):
@@ -90,15 +96,3 @@ def is_long(file: InputFile) -> bool:
         sizes = (x.stat().st_size for x in files_of(file.format, file.input))
         return sum(sizes) > form.shard_bytes
     return not form.is_small
-
-
-def _time_slices(file: InputFile) -> list[InputFile]:
-    """Return what of a file can be read apart; itself, where it has no slices.
-
-    So it is where it cannot be opened: whoever reads it says why.
-    """
-    try:
-        specs = pieces(file.format, file.input, file.spec)
-    except InputError:
-        return [file]
-    return [dataclasses.replace(file, spec=spec) for spec in specs]

@@ -1,6 +1,7 @@
 """The data-quality report of an import: counts, noise, headways, labels, drops."""
 
 import dataclasses
+import itertools
 from collections import Counter
 from collections.abc import Mapping
 
@@ -57,17 +58,15 @@ class QualityReport:
     # lanes without a speed limit or width, road users without a size, and all of them
     assumed: Counter = dataclasses.field(default_factory=Counter)
 
-    def add_refusal(self, recording: Recording) -> None:
-        """Count a recording that is left out, and note why."""
-        self.refused += 1
-        self.notes.append(f"left out: {recording.refused}")
-
-    def add_empty(self, recording: Recording) -> None:
-        """Count and note a recording in which nobody drives."""
-        self.empty += 1
-        self.notes += [
-            f"{recording.name}: {x}" for x in ("no traffic", *recording.notes)
-        ]
+    def add_nothing(self, recording: Recording) -> None:
+        """Count and note a recording that is left out, or in which nobody drives."""
+        if recording.refused:
+            self.refused += 1
+            self.notes.append(f"left out: {recording.refused}")
+        else:
+            self.empty += 1
+            notes = ("no traffic", *recording.notes)
+            self.notes += [f"{recording.name}: {note}" for note in notes]
 
     def add_recording(self, collector: Collector) -> None:
         """Count a recording's tracks, noise, drop reasons and notes."""
@@ -115,9 +114,17 @@ class QualityReport:
         for decision in Decision:
             chosen = (np.asarray(demonstrations.decisions) == decision) & known
             self.decisions[decision.name.lower()] += int(np.sum(chosen))
+        # time headway [s] to the followed car at the planning frame, if any
+        speed = np.asarray(scene.ego.v)
+        follows = np.asarray(demonstrations.decisions) == Decision.FOLLOW
+        front = 0.5 * np.asarray(scene.ego.length)[:, None]
+        gap = np.asarray(scene.obstacles.s_lower)[:, :, 0] - front
+        usable = follows & (gap > 0.0) & (speed[:, None] > 2.0)
+        headway = gap / np.maximum(speed, 1e-3)[:, None]
+        headway = np.min(np.where(usable, headway, np.inf), axis=1)
         for counts, values, step in (
-            (self.headways, _headways(demonstrations), HEADWAY_STEP_S),
-            (self.speeds, np.asarray(scene.ego.v), SPEED_STEP_MPS),
+            (self.headways, headway[np.isfinite(headway)], HEADWAY_STEP_S),
+            (self.speeds, speed, SPEED_STEP_MPS),
             (self.futures, np.asarray(demonstrations.future_s), FUTURE_STEP_S),
         ):
             counts.update(map(str, np.round(values / step).astype(int).tolist()))
@@ -143,6 +150,9 @@ class QualityReport:
     def as_dict(self) -> dict:
         """JSON-ready summary."""
         total = max(self.accelerations, 1)
+        values, times = _sorted(self.headways, HEADWAY_STEP_S)
+        edges = (0.0, *HEADWAY_EDGES_S, np.inf)
+        binned = np.histogram(values, edges, weights=times)[0]
         is_assumed = any(self.assumed[what] for what in (LIMIT, WIDTH, SIZE))
         return {
             "recordings": self.recordings,
@@ -153,7 +163,12 @@ class QualityReport:
             "harsh_share_raw": self.harsh_raw / total,
             "harsh_share_smoothed": self.harsh_smooth / total,
             "headway_s": _quantiles(self.headways, HEADWAY_STEP_S),
-            "headway_histogram": _histogram(self.headways, HEADWAY_STEP_S),
+            "headway_histogram": {
+                f"{low:g}-{high:g} s": int(count)
+                for (low, high), count in zip(
+                    itertools.pairwise(edges), binned, strict=True
+                )
+            },
             "speed_mps": _quantiles(self.speeds, SPEED_STEP_MPS),
             "future_s": _quantiles(self.futures, FUTURE_STEP_S),
             "shortened": self.shortened,
@@ -181,15 +196,6 @@ def assumed(recording: Recording) -> dict[str, int]:
     }
 
 
-def _assumed_line(counts: Mapping[str, int]) -> str:
-    parts = [
-        f"{what} of {counts[what]:,} of {counts[whole]:,} {whole}"
-        for what, whole in ((LIMIT, "lanes"), (WIDTH, "lanes"), (SIZE, "road users"))
-        if counts.get(what)
-    ]
-    return f"assumed, for the log does not say it: {', '.join(parts)}"
-
-
 def remedies(dropped: Mapping[str, int]) -> str:
     """Why scenes were dropped, most frequent first, and what to do about each."""
     counts = sorted(dropped.items(), key=lambda item: -item[1])
@@ -201,18 +207,6 @@ def remedies(dropped: Mapping[str, int]) -> str:
 def dropped_rows(rows: Mapping[str, int]) -> int:
     """Return rows of tables that were dropped."""
     return sum(count for why, count in rows.items() if why != "read")
-
-
-def _headways(demonstrations: Demonstration) -> np.ndarray:
-    """Return time headway [s] to the followed car at the planning frame, if any."""
-    scene = demonstrations.scene
-    follows = np.asarray(demonstrations.decisions) == Decision.FOLLOW
-    front = 0.5 * np.asarray(scene.ego.length)[:, None]
-    gap = np.asarray(scene.obstacles.s_lower)[:, :, 0] - front
-    speed = np.maximum(np.asarray(scene.ego.v), 1e-3)[:, None]
-    usable = follows & (gap > 0.0) & (speed > 2.0)
-    headway = np.min(np.where(usable, gap / speed, np.inf), axis=1)
-    return headway[np.isfinite(headway)]
 
 
 def _sorted(counts: Counter, step: float) -> tuple[np.ndarray, np.ndarray]:
@@ -230,16 +224,6 @@ def _quantiles(counts: Counter, step: float) -> dict | None:
     at = np.searchsorted(np.cumsum(times), np.array([0.05, 0.5, 0.95]) * times.sum())
     found = values[np.minimum(at, values.size - 1)]
     return dict(zip(("p05", "p50", "p95"), found.tolist(), strict=True))
-
-
-def _histogram(counts: Counter, step: float) -> dict[str, int]:
-    edges = (0.0, *HEADWAY_EDGES_S, np.inf)
-    values, times = _sorted(counts, step)
-    found = np.histogram(values, edges, weights=times)[0]
-    return {
-        f"{low:g}-{high:g} s": int(n)
-        for low, high, n in zip(edges[:-1], edges[1:], found, strict=True)
-    }
 
 
 def format_quality(report: dict) -> str:
@@ -301,7 +285,14 @@ def oddities(report: Mapping) -> list[str]:
     if report.get("empty"):
         lines.append(f"{report['empty']} recordings without traffic skipped")
     if report.get("assumed"):
-        lines.append(_assumed_line(report["assumed"]))
+        counts = report["assumed"]
+        wholes = (LIMIT, "lanes"), (WIDTH, "lanes"), (SIZE, "road users")
+        parts = [
+            f"{what} of {counts[what]:,} of {counts[whole]:,} {whole}"
+            for what, whole in wholes
+            if counts.get(what)
+        ]
+        lines.append(f"assumed, for the log does not say it: {', '.join(parts)}")
     lines += [f"note: {note}" for note in report["notes"][:NOTES_SHOWN]]
     if report["num_notes"] > NOTES_SHOWN:
         lines.append(f"{report['num_notes']} notes in all: manifest.json")

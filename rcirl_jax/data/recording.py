@@ -15,7 +15,7 @@ import numpy as np
 
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.runtime.atomic_files import is_text
-from rcirl_jax.types import Kind, Lane, MissingAgent, Recording, Signal, Track
+from rcirl_jax.types import Kind, Lane, Recording, Signal, Track
 from rcirl_jax.units import FOOT_M, MPH_MPS
 
 # keys that an import adds to a spec
@@ -125,47 +125,63 @@ def validate_recording(
         )
     if not recording.tracks:
         return recording  # counted as empty, and skipped
-    _check_texts(name, recording)
-    _check_unique(name, "track id", [track.id for track in recording.tracks])
-    _check_unique(name, "lane id", [lane.id for lane in recording.lanes])
-    _check_unique(name, "signal id", [signal.id for signal in recording.signals])
-    for track in recording.tracks:
-        _check_track(name, track)
-    _check_rate(name, recording)
-    begin = min(float(track.t[0]) for track in recording.tracks)
-    for signal in recording.signals:
-        _check_signal(name, signal, begin)
-    for agent in recording.missing_agents:
-        _check_missing_agent(name, agent)
-    lanes = {lane.id for lane in recording.lanes}
-    signals = {signal.id for signal in recording.signals}
-    checked = [_check_lane(name, lane, lanes, signals) for lane in recording.lanes]
-    _check_places(name, recording)
-    _check_against_motion(name, recording)
-    return dataclasses.replace(recording, lanes=tuple(checked))
-
-
-def _check_texts(name: str, recording: Recording) -> None:
-    parts = (*recording.tracks, *recording.lanes, *recording.signals)
+    tracks, lanes, signals = recording.tracks, recording.lanes, recording.signals
     texts = {
         "name": recording.name,
         "group": recording.group or "",
         "source": recording.source,
         "licence": recording.licence,
-        "id": "".join(part.id for part in parts),
+        "id": "".join(part.id for part in (*tracks, *lanes, *signals)),
         "notes": "".join(recording.notes),
     }
     for field, text in texts.items():
         if not is_text(text):
             raise InputError(f"{name}: {field}: {text!a:.80}: expected UTF-8 text")
-
-
-def _check_unique(name: str, field: str, ids: list[str]) -> None:
-    seen: set[str] = set()
-    for item in ids:
-        if item in seen:
-            raise InputError(f"{name}: {field}: {item}: met twice: expected once")
-        seen.add(item)
+    for what, parts in (("track", tracks), ("lane", lanes), ("signal", signals)):
+        seen: set[str] = set()
+        for part in parts:
+            if part.id in seen:
+                raise InputError(
+                    f"{name}: {what} id: {part.id}: met twice: expected once"
+                )
+            seen.add(part.id)
+    for track in tracks:
+        _check_track(name, track)
+    steps = np.concatenate([np.diff(track.t) for track in tracks])
+    expected = 1.0 / recording.rate_hz
+    step = float(np.median(steps)) if steps.size else expected
+    if abs(step / expected - 1.0) > RATE_TOLERANCE:
+        raise InputError(
+            f"{name}: t: median step {step:g} s: expected {expected:g} s "
+            f"(rate_hz {recording.rate_hz:g})"
+        )
+    begin = min(float(track.t[0]) for track in tracks)
+    for signal in signals:
+        _check_signal(name, signal, begin)
+    for agent in recording.missing_agents:
+        values = (agent.t0, agent.t1, *agent.start, *agent.end)
+        if not np.isfinite(values).all() or agent.t1 < agent.t0:
+            raise InputError(
+                f"{name}: missing agent: {values}: expected finite, t1 >= t0"
+            )
+    lane_ids, signal_ids = {lane.id for lane in lanes}, {x.id for x in signals}
+    checked = [_check_lane(name, lane, lane_ids, signal_ids) for lane in lanes]
+    for place, axis in enumerate(("x", "y")):
+        driven = [getattr(track, axis) for track in tracks]
+        check_span(f"{name}: tracks", axis, np.concatenate(driven))
+        centres = [lane.centre[:, place] for lane in lanes]
+        check_span(f"{name}: lanes", axis, np.concatenate([*centres, np.zeros(0)]))
+    lengths = (np.hypot(*np.diff(lane.centre, axis=0).T).sum() for lane in lanes)
+    check_lanes_length(name, sum(map(float, lengths)))
+    # positions are rarely wrong: sizes, speeds and headings that contradict them are
+    # refused, and the likely cause is named; few moving road users are not judged
+    cars = [track for track in tracks if track.kind == Kind.VEHICLE]
+    if len(cars) >= MIN_CARS:
+        _check_sizes(name, cars, lanes)
+    _check_speeds(name, recording)
+    if len(cars) >= MIN_CARS:
+        _check_headings(name, cars, recording.rate_hz)
+    return dataclasses.replace(recording, lanes=tuple(checked))
 
 
 def _check_track(name: str, track: Track) -> None:
@@ -185,7 +201,15 @@ def _check_track(name: str, track: Track) -> None:
         raise InputError(
             f"{where}: t: {after:g} s after {before:g} s: expected increasing times"
         )
-    _check_driver(where, track)
+    place = track.destination
+    if place is not None and not np.isfinite(place).all():
+        raise InputError(f"{where}: destination: {place}: expected finite numbers")
+    for field in ("automated", "leader_missing"):
+        for low, high in getattr(track, field):
+            if not low <= high:
+                raise InputError(
+                    f"{where}: {field}: {low} to {high} s: expected a span"
+                )
     static = track.kind == Kind.STATIC
     for field, moving in (("length", LENGTH_RANGE_M), ("width", WIDTH_RANGE_M)):
         low, high = STATIC_RANGE_M if static else moving
@@ -199,18 +223,6 @@ def _check_track(name: str, track: Track) -> None:
         raise InputError(
             f"{where}: speed: {fastest:g} m/s: expected below {MAX_SPEED_MPS:g} m/s"
         )
-
-
-def _check_driver(where: str, track: Track) -> None:
-    place = track.destination
-    if place is not None and not np.isfinite(place).all():
-        raise InputError(f"{where}: destination: {place}: expected finite numbers")
-    for field in ("automated", "leader_missing"):
-        for low, high in getattr(track, field):
-            if not low <= high:
-                raise InputError(
-                    f"{where}: {field}: {low} to {high} s: expected a span"
-                )
 
 
 def check_span(where: str, field: str, values: np.ndarray) -> None:
@@ -237,32 +249,6 @@ def check_lanes_length(where: str, total: float) -> None:
         )
 
 
-def _check_places(name: str, recording: Recording) -> None:
-    """Tracks and lanes lie near each other, and lanes are no longer than roads are."""
-    for place, axis in enumerate(("x", "y")):
-        driven = [getattr(track, axis) for track in recording.tracks]
-        check_span(f"{name}: tracks", axis, np.concatenate(driven))
-        lanes = [lane.centre[:, place] for lane in recording.lanes]
-        check_span(f"{name}: lanes", axis, np.concatenate([*lanes, np.zeros(0)]))
-    total = sum(
-        float(np.hypot(*np.diff(lane.centre, axis=0).T).sum())
-        for lane in recording.lanes
-    )
-    check_lanes_length(name, total)
-
-
-def _check_rate(name: str, recording: Recording) -> None:
-    steps = np.concatenate([np.diff(track.t) for track in recording.tracks])
-    if steps.size == 0:
-        return
-    step, expected = float(np.median(steps)), 1.0 / recording.rate_hz
-    if abs(step / expected - 1.0) > RATE_TOLERANCE:
-        raise InputError(
-            f"{name}: t: median step {step:g} s: expected {expected:g} s "
-            f"(rate_hz {recording.rate_hz:g})"
-        )
-
-
 def _check_signal(name: str, signal: Signal, begin: float) -> None:
     where = f"{name}: signal {signal.id}"
     if signal.start.size != len(signal.state) or signal.start.size == 0:
@@ -280,12 +266,6 @@ def _check_signal(name: str, signal: Signal, begin: float) -> None:
             f"{where}: start: {signal.start[0]:g} s: "
             f"expected at or before the first track, {begin:g} s"
         )
-
-
-def _check_missing_agent(name: str, agent: MissingAgent) -> None:
-    values = (agent.t0, agent.t1, *agent.start, *agent.end)
-    if not np.isfinite(values).all() or agent.t1 < agent.t0:
-        raise InputError(f"{name}: missing agent: {values}: expected finite, t1 >= t0")
 
 
 def _check_lane(name: str, lane: Lane, lanes: set[str], signals: set[str]) -> Lane:
@@ -324,20 +304,6 @@ def _check_lane(name: str, lane: Lane, lanes: set[str], signals: set[str]) -> La
 # --------------------------------------------------------- against the motion
 
 
-def _check_against_motion(name: str, recording: Recording) -> None:
-    """Check sizes, speeds and headings against positions and lanes.
-
-    Positions are rarely wrong. What contradicts them is refused, and the likely cause
-    is named. A recording with few moving road users is not judged.
-    """
-    cars = [track for track in recording.tracks if track.kind == Kind.VEHICLE]
-    if len(cars) >= MIN_CARS:
-        _check_sizes(name, cars, recording.lanes)
-    _check_speeds(name, recording)
-    if len(cars) >= MIN_CARS:
-        _check_headings(name, cars, recording.rate_hz)
-
-
 def _check_sizes(name: str, cars: Sequence[Track], lanes: Sequence[Lane]) -> None:
     """Check the median vehicle: as long as a car, narrower than its lane."""
     lengths = [track.length for track in cars]
@@ -374,26 +340,22 @@ def _windows(track: Track, rate_hz: float) -> tuple[int, np.ndarray, np.ndarray]
     return span, place[span:] - place[:-span], track.t[span:] - track.t[:-span]
 
 
-def _speed_ratios(track: Track, rate_hz: float) -> np.ndarray:
-    """Return recorded speed over speed from positions, in windows where it moves.
+def _check_speeds(name: str, recording: Recording) -> None:
+    """Check the recorded speed over that of positions, in windows with motion.
 
     ratio = integral of |speed| dt / distance between the window's ends
     """
-    span, moved, lasted = _windows(track, rate_hz)
-    if not span:
-        return np.zeros(0)
-    speed = np.abs(track.speed)
-    mean = 0.5 * (speed[1:] + speed[:-1])
-    path = np.concatenate([[0.0], np.cumsum(mean * np.diff(track.t))])
-    recorded, distance = path[span:] - path[:-span], np.hypot(*moved.T)
-    moving = np.maximum(recorded, distance) > MOVING_MPS * lasted
-    return recorded[moving] / np.maximum(distance[moving], 1e-9)
-
-
-def _check_speeds(name: str, recording: Recording) -> None:
-    moving = [track for track in recording.tracks if track.kind != Kind.STATIC]
-    found = [_speed_ratios(track, recording.rate_hz) for track in moving]
-    ratios = np.concatenate([np.zeros(0), *found])
+    found = [np.zeros(0)]
+    for track in recording.tracks:
+        span, moved, lasted = _windows(track, recording.rate_hz)
+        if track.kind != Kind.STATIC and span:
+            speed = np.abs(track.speed)
+            mean = 0.5 * (speed[1:] + speed[:-1])
+            path = np.concatenate([[0.0], np.cumsum(mean * np.diff(track.t))])
+            recorded, distance = path[span:] - path[:-span], np.hypot(*moved.T)
+            moving = np.maximum(recorded, distance) > MOVING_MPS * lasted
+            found.append(recorded[moving] / np.maximum(distance[moving], 1e-9))
+    ratios = np.concatenate(found)
     if ratios.size < MIN_MOVING_SAMPLES:
         return
     ratio = float(np.median(ratios))

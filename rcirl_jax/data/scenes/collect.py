@@ -7,7 +7,6 @@ is counted by reason.
 """
 
 import collections
-import functools
 import itertools
 from collections.abc import Iterator
 from typing import Any
@@ -37,7 +36,6 @@ from rcirl_jax.types import (
     Demonstration,
     Ego,
     Kind,
-    MissingAgent,
     Obstacles,
     Path,
     Recording,
@@ -120,12 +118,11 @@ class Collector:
 
     def scenes(self) -> Iterator[dict]:
         """Yield rows of one scene each, as flat dicts of numpy arrays."""
-        drivers = (
-            (number, smooth)
+        rows = itertools.chain.from_iterable(
+            self._scenes_of(number, smooth)
             for number, smooth in enumerate(self.tracks)
             if smooth.track.kind == Kind.VEHICLE
         )
-        rows = itertools.chain.from_iterable(self._scenes_of(*one) for one in drivers)
         while some := list(itertools.islice(rows, LABELLED_AT_ONCE)):
             labels.add_labels(some)
             yield from some
@@ -349,6 +346,13 @@ class Collector:
         length, width = self._size[others[most]].T[..., None]
         half_s = 0.5 * (length * along + width * across)
         half_l = 0.5 * (length * across + width * along)
+        # acceleration and lateral speed at the planning frame, over +-1 sample
+        of = others[most]
+        frame = np.rint(clock[0] * self.rate).astype(int) - self._first[of]
+        last = self._last[of] - self._first[of]
+        before, after = (np.clip(frame + step, 0, last) for step in (-1, 1))
+        low, high = (view.table[self._offset[of] + at] for at in (before, after))
+        change = (high - low) / (np.maximum(after - before, 1) / self.rate)[:, None]
         return others[order], {
             "s_lower": s - half_s,
             "s_upper": s + half_s,
@@ -356,28 +360,24 @@ class Collector:
             "l_upper": l + half_l,
             "speed": speed[most],
             "valid": seen[most],
-            **self._rates(view, others[most], clock[0]),
+            "a": change[:, 3],
+            "l_dot": change[:, 1],
         }
-
-    def _rates(
-        self, view: FrameTracks, tracks: np.ndarray, now: float
-    ) -> dict[str, np.ndarray]:
-        """Acceleration and lateral speed [k] of tracks at a time, over +-1 sample."""
-        last = self._last[tracks] - self._first[tracks]
-        frame = np.rint(now * self.rate).astype(int) - self._first[tracks]
-        before, after = (np.clip(frame + step, 0, last) for step in (-1, 1))
-        span = np.maximum(after - before, 1) / self.rate
-        low, high = (view.table[self._offset[tracks] + at] for at in (before, after))
-        change = (high - low) / span[:, None]
-        return {"a": change[:, 3], "l_dot": change[:, 1]}
 
     def _missing(self, frame: LaneFrame, start: int, number: int) -> np.ndarray:
         """Return station and offset [g, T, 2] of agents missing from the file."""
         smooth, missing = self.tracks[number], self.recording.missing_agents
         if frame.chain not in self._missing_views:
-            self._missing_views[frame.chain] = [
-                self._missing_view(frame, agent) for agent in missing
-            ]
+            views = self._missing_views[frame.chain] = []
+            for agent in missing:
+                count = int((agent.t1 - agent.t0) * self.rate) + 2
+                share = np.linspace(0.0, 1.0, min(count, MAX_MISSING_POINTS))
+                x, y = (
+                    low + share * (high - low)
+                    for low, high in zip(agent.start, agent.end, strict=True)
+                )
+                times = agent.t0 + share * (agent.t1 - agent.t0)
+                views.append((times, *project(frame, x, y)))
         clock = (smooth.first_frame + start) / self.rate + TIMES_S
         s0 = self.view(frame).s[number][start]
         found = np.empty((len(missing), TIMES_S.size, 2))
@@ -387,18 +387,6 @@ class Collector:
             row[:, 0] = np.interp(clock, times, s) - s0
             row[:, 1] = np.interp(clock, times, l)
         return found
-
-    def _missing_view(
-        self, frame: LaneFrame, agent: MissingAgent
-    ) -> tuple[np.ndarray, ...]:
-        """Return (times, s, l) of a missing agent in a chain's frame."""
-        count = int((agent.t1 - agent.t0) * self.rate) + 2
-        share = np.linspace(0.0, 1.0, min(count, MAX_MISSING_POINTS))
-        x, y = (
-            low + share * (high - low)
-            for low, high in zip(agent.start, agent.end, strict=True)
-        )
-        return agent.t0 + share * (agent.t1 - agent.t0), *project(frame, x, y)
 
 
 # ------------------------------------------------------- rows -> a Demonstration
@@ -424,9 +412,7 @@ def stack_scenes(rows: list[dict]) -> Scene:
     )
 
 
-@functools.cache
-def _complete() -> jax.stages.Wrapped:
-    return jax.jit(jax.vmap(trajectory_from_positions))
+_complete = jax.jit(jax.vmap(trajectory_from_positions))
 
 
 def human_trajectories(scene: Scene, s: np.ndarray, l: np.ndarray) -> Trajectory:
@@ -436,7 +422,7 @@ def human_trajectories(scene: Scene, s: np.ndarray, l: np.ndarray) -> Trajectory
     for start in range(0, count, CHUNK):
         index = np.minimum(np.arange(start, start + CHUNK), count - 1)
         chunk = jax.tree.map(lambda x, index=index: x[index], scene)
-        full = _complete()(chunk, s[index], l[index])
+        full = _complete(chunk, s[index], l[index])
         keep = min(CHUNK, count - start)
         parts.append(jax.tree.map(lambda x, keep=keep: np.asarray(x)[:keep], full))
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
@@ -457,19 +443,22 @@ def assemble(
       Demonstration with numpy leaves [n, ...].
     """
     scene = stack_scenes(rows)
-    s = np.array([row["human.s"] for row in rows], np.float32)
-    l = np.array([row["human.l"] for row in rows], np.float32)
-    leaves: dict[str, Any] = {
-        "decisions": np.array([row["decisions"] for row in rows], np.int32),
-        "future_s": np.array([row["future_s"] for row in rows], np.float32),
-        "s_at_5s": np.array([row["s_at_5s"] for row in rows], np.float32),
+
+    def column(name: str, dtype: type) -> Any:  # noqa: ANN401
+        return np.array([row[name] for row in rows], dtype)
+
+    s, l = column("human.s", np.float32), column("human.l", np.float32)
+    numbers: dict[str, Any] = {
         "vehicle": np.array(vehicles, np.int32),
         "recording": np.full(len(rows), recording, np.int32),
         "group": np.array(groups, np.int32),
-        "frame": np.array([row["frame"] for row in rows], np.int32),
     }
     return Demonstration(
         scene=scene,
         human=human_trajectories(scene, s, l),
-        **leaves,
+        decisions=column("decisions", np.int32),
+        future_s=column("future_s", np.float32),
+        s_at_5s=column("s_at_5s", np.float32),
+        frame=column("frame", np.int32),
+        **numbers,
     )

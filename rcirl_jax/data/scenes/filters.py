@@ -111,13 +111,7 @@ def reject(
     body = row["obstacles.valid"] & (kind >= Kind.VEHICLE) & (kind <= Kind.STATIC)
     if np.any(body & row["time_valid"] & (np.maximum(gap, lateral) < -OVERLAP_M)):
         return "overlapping_boxes"
-    if follows_missing_agent(row, motion, missing):
-        return "follows_missing_car"
-    return None
-
-
-def follows_missing_agent(row: dict, motion: Motion, missing: np.ndarray) -> bool:
-    """Return whether a missing agent drives in the ego's lane, nobody in between."""
+    # a missing agent drives in the ego's lane, nobody in between
     for agent in missing:
         ahead = (agent[:, 0] > motion.s) & (
             np.abs(agent[:, 1] - motion.l) < SAME_LANE_M
@@ -133,8 +127,8 @@ def follows_missing_agent(row: dict, motion: Motion, missing: np.ndarray) -> boo
             & (np.abs(lateral - motion.l) < SAME_LANE_M)
         ).any(axis=0)
         if np.any(ahead & ~between & row["time_valid"]):
-            return True
-    return False
+            return "follows_missing_car"
+    return None
 
 
 # ----------------------------------------------------------------- surroundings
@@ -183,35 +177,25 @@ def _matters(row: dict, slot: int, end: float) -> bool:
         boxes[name][slot] += speed * (TIMES_S[now] - end)
     kind = row["obstacles.kind"]
     there = valid[:, now] & (kind >= Kind.VEHICLE) & (kind <= Kind.STATIC)
+    middle = 0.5 * (boxes["s_lower"] + boxes["s_upper"])
+    lateral = 0.5 * (boxes["l_lower"] + boxes["l_upper"])
+    same = np.abs(middle - middle[slot]) < SAME_PLACE_M
+    same &= np.abs(lateral - lateral[slot]) < SAME_PLACE_M
     there[slot] = False
-    if (there & _same_place(boxes, slot)).any():
+    if (there & same).any():
         return False
     there[slot] = True
-    middle = 0.5 * (boxes["s_lower"] + boxes["s_upper"])
     path_l = np.interp(middle, GRID_M, row["path.l"])
     aside = np.maximum(boxes["l_lower"] - path_l, path_l - boxes["l_upper"])
     aside -= 0.5 * row["ego.width"]
     on_path = there & (aside < LATERAL_BUFFER_M) & (middle > row["human.s"][now])
     if on_path[slot]:
         return slot == int(np.argmin(np.where(on_path, boxes["s_lower"], np.inf)))
-    is_beside = LATERAL_BUFFER_M <= aside[slot] < NUDGE_RANGE_M
-    return bool(is_beside) and _is_passed(row, boxes, slot, now)
-
-
-def _same_place(boxes: dict, slot: int) -> np.ndarray:
-    """Return [N] bool: boxes about where the one in a slot is."""
-    near = np.ones(boxes["speed"].shape, bool)
-    for axis in ("s", "l"):
-        lower, upper = boxes[f"{axis}_lower"], boxes[f"{axis}_upper"]
-        middle = 0.5 * (lower + upper)
-        near &= np.abs(middle - middle[slot]) < SAME_PLACE_M
-    return near
-
-
-def _is_passed(row: dict, boxes: dict, slot: int, now: int) -> bool:
-    """Return whether the human passes a slower one, at its speed, from `now` on."""
+    if not LATERAL_BUFFER_M <= aside[slot] < NUDGE_RANGE_M:
+        return False
+    # beside: whether the human passes the slower one, at its speed, from `now` on
     human, times = row["human.s"][now:], TIMES_S[now:]
-    half, speed = 0.5 * row["ego.length"], boxes["speed"][slot]
+    half = 0.5 * row["ego.length"]
     if human.size < 2 or speed < -MOVING_MPS:
         return False
     drives_off = speed * (times - times[0])

@@ -57,35 +57,28 @@ def add_labels(rows: Sequence[dict]) -> None:
 def labels_of(scenes: dict) -> tuple[np.ndarray, np.ndarray]:
     """Decisions [S, N] and tags [S, G] of scenes, `FIELDS` with a leading [S]."""
     met, speed = meetings(scenes), human_speed(scenes)
-    decisions = _decide(scenes, met, speed)
-    return decisions, _tags(scenes, decisions, met, speed)
-
-
-def _decide(scenes: dict, met: Meetings, speed: np.ndarray) -> np.ndarray:
-    """Labels [..., N]; `speed` [..., T] m/s of the human."""
     kind = scenes["obstacles.kind"]
     is_line = (kind == Kind.STOP) | (kind == Kind.VIRTUAL)
-    to_left = manoeuvres.nudged_to_left(met)
-    nudge = np.where(to_left, Decision.NUDGE_LEFT, Decision.NUDGE_RIGHT)
-    rules = [
-        (is_line, _decide_line(scenes, speed)),
-        (manoeuvres.overtaken(met), Decision.OVERTAKE),
-        (manoeuvres.nudged(met), nudge),
-        (manoeuvres.yields(met), Decision.YIELD),
-        (manoeuvres.follows(met), Decision.FOLLOW),
-    ]
-    holds, labels = zip(*rules, strict=True)
-    return np.select(holds, labels, Decision.IGNORE).astype(np.int32)
-
-
-def _decide_line(scenes: dict, speed: np.ndarray) -> np.ndarray:
-    """[..., N] STOP if the human stands before the line (or at the destination)."""
+    # STOP if the human stands before the line (or at the destination)
     half_length = 0.5 * np.asarray(scenes["ego.length"])[..., None, None]
     front = scenes["human.s"][..., None, :] + half_length
     gap = scenes["obstacles.s_lower"] - front
     near = (gap > -2.0) & (gap < STOP_REACH_M)
     stands = ((speed < STANDING_MPS) & scenes["time_valid"])[..., None, :] & near
-    return np.where(stands.any(axis=-1), Decision.STOP, Decision.IGNORE)
+    to_left = manoeuvres.nudged_to_left(met)
+    rules = [
+        (is_line, np.where(stands.any(axis=-1), Decision.STOP, Decision.IGNORE)),
+        (manoeuvres.overtaken(met), Decision.OVERTAKE),
+        (
+            manoeuvres.nudged(met),
+            np.where(to_left, Decision.NUDGE_LEFT, Decision.NUDGE_RIGHT),
+        ),
+        (manoeuvres.yields(met), Decision.YIELD),
+        (manoeuvres.follows(met), Decision.FOLLOW),
+    ]
+    holds, labels = zip(*rules, strict=True)
+    decisions = np.select(holds, labels, Decision.IGNORE).astype(np.int32)
+    return decisions, _tags(scenes, decisions, met, speed)
 
 
 def _changes_lane(scenes: dict) -> np.ndarray:

@@ -70,7 +70,9 @@ class LaneGraph:
                     self.predecessors[successor].append(lane.id)
         points, headings, owners = [], [], []
         for lane in recording.lanes:
-            dense = _densify(lane.centre, 1.0)
+            arc = _arc(lane.centre)  # a point about every metre of it
+            grid = np.linspace(0.0, arc[-1], max(int(arc[-1]) + 1, 2))
+            dense = np.stack([np.interp(grid, arc, x) for x in lane.centre.T], axis=1)
             direction = np.gradient(dense, axis=0)
             points.append(dense)
             headings.append(np.arctan2(direction[:, 1], direction[:, 0]))
@@ -226,12 +228,6 @@ def project(frame: LaneFrame, x: np.ndarray, y: np.ndarray) -> tuple:
 def _arc(points: np.ndarray) -> np.ndarray:
     steps = np.hypot(*np.diff(points, axis=0).T)
     return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def _densify(points: np.ndarray, step: float) -> np.ndarray:
-    arc = _arc(points)
-    grid = np.linspace(0.0, arc[-1], max(int(arc[-1] / step) + 1, 2))
-    return np.stack([np.interp(grid, arc, points[:, i]) for i in (0, 1)], axis=1)
 
 
 def _end_heading(points: np.ndarray, end: int) -> float:

@@ -201,11 +201,6 @@ def _around(index: np.ndarray, before_s: float, after_s: float) -> np.ndarray:
     return (apart >= -before_s) & (apart <= after_s)
 
 
-def _least(values: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """[..., N], the least of the values at the times `where`; inf if at none."""
-    return np.min(np.where(where, values, np.inf), axis=-1)
-
-
 # ------------------------------------------------------------------ manoeuvres
 
 
@@ -298,7 +293,8 @@ def yields(m: Meetings) -> np.ndarray:
     before = np.where(window, m.human_speed, -np.inf)
     given_up = np.maximum.accumulate(before, axis=-1) - m.human_speed
     given_up = np.max(np.where(window, given_up, 0.0), axis=-1)
-    braking = -_least(np.gradient(m.human_speed, TIMES_S, axis=-1), window)
+    slowing = np.gradient(m.human_speed, TIMES_S, axis=-1)
+    braking = -np.min(np.where(window, slowing, np.inf), axis=-1)
     brakes = (given_up >= BRAKES_MPS) & (braking >= BRAKES_MPS2)
     gap = np.where(there & window, m.gap, -np.inf)
     grows = np.max(gap, axis=-1) - at(m.gap, index) >= FALLS_BACK_M

@@ -61,8 +61,12 @@ class Event:
         Whether a car goes straight or turns is not known. A dark signal (an
         arrow that is off) leaves the word to the others.
         """
-        time = np.array([self.time])
-        states = {_turned(signal, time, offset) for signal in self.signals}
+        states = set()
+        for signal in self.signals:
+            cycle, first, time = period(signal), float(signal.start[0]), self.time
+            if cycle is not None:
+                time = first + (time - offset - first) % cycle
+            states.add(str(signal_state(signal, np.array([time]))[0]))
         return next(name for name in ORDER if name in states)
 
 
@@ -94,15 +98,6 @@ def period(signal: Signal) -> float | None:
     return None
 
 
-def _turned(signal: Signal, times: np.ndarray, offset: float) -> str:
-    """State with the schedule moved by `offset` s, repeated by its period."""
-    cycle = period(signal)
-    if cycle is None:
-        return str(signal_state(signal, times)[0])
-    first = float(signal.start[0])
-    return str(signal_state(signal, first + (times - offset - first) % cycle)[0])
-
-
 # ------------------------------------------------------------------- observed
 
 
@@ -130,45 +125,36 @@ def before_line(track: Track, lane: Lane) -> tuple[np.ndarray, np.ndarray]:
     return distance, (share > 0.0) & (share < 1.0) & (same_way > 0.5)
 
 
-def observe(recording: Recording) -> dict[tuple[str, ...], list[Event]]:
-    """Crossings and stands by the ids of the signals that govern one line."""
+# events by the name of their line, each with the name of its recording
+LineEvents = dict[str, list[tuple[str, Event]]]
+
+
+def line_events(recording: Recording) -> LineEvents:
+    """Crossings and stands of a recording at every line with signals; possibly none."""
     by_id = {signal.id: signal for signal in recording.signals}
-    found: dict[tuple[str, ...], list[Event]] = collections.defaultdict(list)
+    made: LineEvents = collections.defaultdict(list)
     for lane in recording.lanes:
         signals = tuple(by_id[i] for i in lane.signal_ids if i in by_id)
         if lane.stop_line is None or not signals:
             continue
-        found[tuple(sorted(signal.id for signal in signals))] += [
-            Event(time=time, crossing=crossing, right=right, signals=signals)
-            for time, crossing, right in _events(recording, lane)
-        ]
-    return dict(found)
-
-
-def _events(recording: Recording, lane: Lane) -> list[tuple[float, bool, bool]]:
-    """(time s, crossing, right) of crossings, and of the middle of first stands."""
-    found = []
-    for track in recording.tracks:
-        time = crossing_time(track, lane)
-        if time is not None:
-            found.append((time, True, _turns_right(track, time)))
-    for times in first_stands(recording, lane).values():
-        if times[-1] - times[0] >= MIN_STAND_S:
-            found.append((float(np.mean(times)), False, False))
-    return found
-
-
-def crossing_time(track: Track, lane: Lane) -> float | None:
-    """Return time [s] at which a track's front is first over the lane's line."""
-    distance, reach = before_line(track, lane)
-    over = (distance[:-1] > 0.0) & (distance[1:] <= 0.0) & reach[1:]
-    return float(track.t[1:][over][0]) if over.any() else None
-
-
-def _turns_right(track: Track, time: float) -> bool:
-    after = (track.t >= time) & (track.t <= time + TURN_S)
-    heading = np.unwrap(track.heading)[after]
-    return bool(heading[0] - heading.min() > RIGHT_RAD)
+        events = made[line_name(recording.name, [signal.id for signal in signals])]
+        for track in recording.tracks:
+            # when the track's front is first over the line
+            distance, reach = before_line(track, lane)
+            over = (distance[:-1] > 0.0) & (distance[1:] <= 0.0) & reach[1:]
+            if over.any():
+                time = float(track.t[1:][over][0])
+                after = (track.t >= time) & (track.t <= time + TURN_S)
+                heading = np.unwrap(track.heading)[after]
+                right = bool(heading[0] - heading.min() > RIGHT_RAD)
+                event = Event(time=time, crossing=True, right=right, signals=signals)
+                events.append((recording.name, event))
+        for times in first_stands(recording, lane).values():
+            if times[-1] - times[0] >= MIN_STAND_S:
+                time = float(np.mean(times))
+                event = Event(time=time, crossing=False, right=False, signals=signals)
+                events.append((recording.name, event))
+    return dict(made)
 
 
 def first_stands(recording: Recording, lane: Lane) -> dict[int, np.ndarray]:
@@ -190,18 +176,6 @@ def first_stands(recording: Recording, lane: Lane) -> dict[int, np.ndarray]:
 
 
 # ---------------------------------------------------------------------- phases
-
-
-# events by the name of their line, each with the name of its recording
-LineEvents = dict[str, list[tuple[str, Event]]]
-
-
-def line_events(recording: Recording) -> LineEvents:
-    """Events of a recording at every line with signals; possibly none."""
-    return {
-        line_name(recording.name, ids): [(recording.name, event) for event in found]
-        for ids, found in observe(recording).items()
-    }
 
 
 def check_events(recorded: Iterable[LineEvents]) -> list[PhaseCheck]:
@@ -259,6 +233,13 @@ def _check(name: str, found: Sequence[tuple[str, Event]]) -> PhaseCheck:
     turn = np.minimum(offsets, cycle - offsets)
     best = int(np.lexsort((turn, -agree.sum(axis=1)))[0])
     p = _p_value(agree, [where for where, _ in found])
+    red_written = _share(red[0], crosses)
+    if crossings < MIN_CROSSINGS:
+        verdict = OPEN[1]
+    elif red_written > MAX_RED_RUNNING:
+        verdict = REJECTED
+    else:
+        verdict = CONFIRMED if p <= MAX_P else OPEN[0]
     return PhaseCheck(
         name=name,
         recordings=len({where for where, _ in found}),
@@ -266,12 +247,12 @@ def _check(name: str, found: Sequence[tuple[str, Event]]) -> PhaseCheck:
         right_turns=right_turns,
         stands=len(events) - crossings,
         period_s=cycle,
-        red_written=_share(red[0], crosses),
+        red_written=red_written,
         stands_red_written=_share(red[0], ~crosses),
         best_offset_s=float(offsets[best]),
         red_best=_share(red[best], crosses),
         p=p,
-        verdict=_verdict(crossings, _share(red[0], crosses), p),
+        verdict=verdict,
     )
 
 
@@ -296,30 +277,21 @@ def _share(values: np.ndarray, among: np.ndarray) -> float:
     return float(np.mean(values[among])) if among.any() else float("nan")
 
 
-def _verdict(crossings: int, red: float, p: float) -> str:
-    if crossings < MIN_CROSSINGS:
-        return OPEN[1]
-    if red > MAX_RED_RUNNING:
-        return REJECTED
-    return CONFIRMED if p <= MAX_P else OPEN[0]
-
-
 def format_phases(checks: Sequence[PhaseCheck]) -> str:
     """Return the checks as a terminal table."""
-    head = (
-        f"{'signals':<34}{'files':>6}{'cross':>6}{'right':>6}{'stand':>6}{'red,%':>7}"
-        f"{'st.red,%':>9}{'best,s':>7}{'red,%':>7}{'p':>6}  verdict"
-    )
-    return "\n".join([head, *(_phase_line(check) for check in checks)])
 
-
-def _phase_line(check: PhaseCheck) -> str:
     def percent(share: float) -> str:
         return "-" if share != share else f"{100.0 * share:.0f}"
 
-    return (
+    lines = [
+        f"{'signals':<34}{'files':>6}{'cross':>6}{'right':>6}{'stand':>6}{'red,%':>7}"
+        f"{'st.red,%':>9}{'best,s':>7}{'red,%':>7}{'p':>6}  verdict"
+    ]
+    lines += [
         f"{check.name[-33:]:<34}{check.recordings:>6}{check.crossings:>6}"
         f"{check.right_turns:>6}{check.stands:>6}{percent(check.red_written):>7}"
         f"{percent(check.stands_red_written):>9}{check.best_offset_s:>7.0f}"
         f"{percent(check.red_best):>7}{check.p:>6.2f}  {check.verdict}"
-    )
+        for check in checks
+    ]
+    return "\n".join(lines)

@@ -41,7 +41,11 @@ def steady_tracks(
     kept = []
     for track in tracks:
         small = max(track.length, track.width) < config.min_size_m
-        short = _life(track, begin, end) < config.min_life_s - 1e-6
+        # whole, and not cut off by the recording's ends; a piece of a longer log knows
+        # when the log first saw the track
+        whole = track.t[0] - begin >= EDGE_S and end - track.t[-1] >= EDGE_S
+        life = float(track.t[-1]) - track.first_seen_s
+        short = bool(whole) and life < config.min_life_s - 1e-6
         counts.update({SMALL: small, SHORT: short and not small})
         kept += [] if small or short else [track]
     counts = +counts
@@ -56,16 +60,6 @@ def note_of(counts: Mapping[str, int]) -> str:
     return f"tracks that flicker: {said}"
 
 
-def _life(track: Track, begin: float, end: float) -> float:
-    """S from the first to the last sample; inf where the recording cuts it off.
-
-    A piece of a longer log knows when the log first saw the track.
-    """
-    if track.t[0] - begin < EDGE_S or end - track.t[-1] < EDGE_S:
-        return np.inf
-    return float(track.t[-1]) - track.first_seen_s
-
-
 def joined(tracks: Sequence[Track], gap_s: float) -> list[Track]:
     """Return the tracks, those in one piece that are fragments of one standing body.
 
@@ -76,29 +70,20 @@ def joined(tracks: Sequence[Track], gap_s: float) -> list[Track]:
     ends = np.array([_sample(track, -1) for track in tracks]).reshape(-1, 4)
     made: dict[int, Track] = {}
     for number in order:
-        before = _goes_on_for(made, tracks[number], ends, gap_s)
-        if before is None:
-            made[number] = tracks[number]
-        else:
-            made[before] = _join(made[before], tracks[number])
-            ends[before] = _sample(made[before], -1)
-            ends[number] = -np.inf
+        after = made[number] = tracks[number]
+        t, x, y, speed = _sample(after, 0)
+        if speed >= STANDING_MPS:
+            continue
+        near = (t <= ends[:, 0] + gap_s) & (ends[:, 3] < STANDING_MPS)
+        near &= np.hypot(ends[:, 1] - x, ends[:, 2] - y) < SAME_PLACE_M
+        for before in np.flatnonzero(near).tolist():
+            if before in made and _is_same(made[before], after):
+                made[before] = _join(made[before], after)
+                ends[before] = _sample(made[before], -1)
+                ends[number] = -np.inf
+                del made[number]
+                break
     return [made[number] for number in sorted(made)]
-
-
-def _goes_on_for(
-    made: dict[int, Track], after: Track, ends: np.ndarray, gap_s: float
-) -> int | None:
-    """Return the number of the track that stands where another begins, or None."""
-    t, x, y, speed = _sample(after, 0)
-    if speed >= STANDING_MPS:
-        return None
-    near = (t <= ends[:, 0] + gap_s) & (ends[:, 3] < STANDING_MPS)
-    near &= np.hypot(ends[:, 1] - x, ends[:, 2] - y) < SAME_PLACE_M
-    for number in np.flatnonzero(near).tolist():
-        if number in made and _is_same(made[number], after):
-            return number
-    return None
 
 
 def _is_same(before: Track, after: Track) -> bool:

@@ -83,9 +83,6 @@ class RowStream:
         self._free = np.arange(self.capacity, dtype=np.int32)
         self._turn = 0
 
-    def __iter__(self) -> "RowStream":
-        return self
-
     def __next__(self) -> Demonstration:
         turn, size = self._turn, self._size
         if turn * size >= self._rows.size:

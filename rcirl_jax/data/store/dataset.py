@@ -26,9 +26,15 @@ import numpy as np
 import tensorstore as ts
 
 from rcirl_jax.data.store.files import FACTS, MANIFEST, SHARDS, Files, context
-from rcirl_jax.data.store.manifest import Manifest, parse_manifest
+from rcirl_jax.data.store.manifest import (
+    BLOCK_ROWS,
+    Manifest,
+    layout,
+    parse_manifest,
+    shard_key,
+    verify_shard,
+)
 from rcirl_jax.data.store.rows import leaf_specs, row_spec
-from rcirl_jax.data.store.shards import BLOCK_ROWS, layout, shard_key, verify_shard
 from rcirl_jax.data.store.splits import check_disjoint
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import parse_json, plain

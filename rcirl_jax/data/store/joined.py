@@ -35,10 +35,7 @@ class JoinedDatasets(Demonstrations):
 
         Args:
           parts: the sources.
-          shares: > 0, one per source; None: every scene weighs 1.
-
-        Raises:
-          InputError: another number of shares, or one that is not positive.
+          shares: > 0, one per source, as of `shares_of`; None: every scene weighs 1.
         """
         self.parts = tuple(parts)
         self._starts = np.cumsum([0, *(part.count for part in parts)])
@@ -46,11 +43,6 @@ class JoinedDatasets(Demonstrations):
         self._weights = np.ones(len(parts), np.float32)
         if shares is not None:
             given = np.asarray(shares, np.float64)
-            if given.shape != (len(parts),) or not np.all(given > 0.0):
-                raise InputError(
-                    f"data_weights: {list(shares)}: expected {len(parts)} numbers "
-                    "> 0, one per source"
-                )
             sizes = np.array([part.indices("train").size for part in parts], float)
             each = sizes.sum() / np.maximum(sizes, 1.0) * given / given.sum()
             self._weights = each.astype(np.float32)

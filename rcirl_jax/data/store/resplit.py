@@ -69,19 +69,6 @@ class Resplit(Demonstrations):
         return self._dataset.read(indices)
 
 
-def by_vehicle(dataset: Demonstrations, share: float, seed: int) -> Resplit:
-    """Hold out about `share` of the egos, drawn by the seed.
-
-    They may still be obstacles in training scenes, with their recorded future.
-    """
-    vehicle = np.asarray(dataset.load(None).vehicle)
-    known = np.unique(vehicle)
-    drawn = np.random.default_rng([seed, 17]).permutation(known)
-    held = np.isin(vehicle, drawn[: max(round(share * known.size), 1)])
-    rows = dataset.indices(None)
-    return Resplit(dataset, {"train": rows[~held], "test": rows[held]})
-
-
 def by_recording(dataset: Demonstrations, recordings: Sequence[int]) -> Resplit:
     """Hold out recordings; scenes of their egos elsewhere leave training too.
 
@@ -243,7 +230,13 @@ def held_out(
       The dataset, and in words how it is split.
     """
     if how == "vehicles":
-        return by_vehicle(dataset, HELD_OUT, seed), f"vehicles, seed {seed}"
+        # they may still be obstacles in training scenes, with their recorded future
+        vehicle, rows = np.asarray(dataset.load(None).vehicle), dataset.indices(None)
+        known = np.unique(vehicle)
+        drawn = np.random.default_rng([seed, 17]).permutation(known)
+        held = np.isin(vehicle, drawn[: max(round(HELD_OUT * known.size), 1)])
+        splits = {TRAIN: rows[~held], TEST: rows[held]}
+        return Resplit(dataset, splits), f"vehicles, seed {seed}"
     if how == "recording":
         named = ", ".join(map(str, recordings))
         return by_recording(dataset, recordings), f"recording {named}"

@@ -21,17 +21,6 @@ LONGEST_BLOCK_S = 30.0  # s, half of the minute that a group usually is
 SHORTEST_BLOCK_S = 0.1  # s, about a frame
 
 
-def _by_size(counts: Mapping[str, int], seed: int) -> list[str]:
-    """Names in seeded random order, then stable-sorted by size, largest first."""
-    for name, count in counts.items():
-        if count < 1:
-            raise ValueError(f"group {name}: {count} rows: expected at least 1")
-    shuffled = sorted(
-        counts, key=lambda name: hashlib.sha256(f"{seed}/{name}".encode()).digest()
-    )
-    return sorted(shuffled, key=lambda name: -counts[name])
-
-
 def assign_groups(
     counts: Mapping[str, int], *, test_fraction: float, seed: int
 ) -> dict[str, list[str]]:
@@ -64,7 +53,13 @@ def assign_groups(
             f"splits: groups: 1 ({next(iter(counts))}): expected at least two "
             f"vehicle-disjoint groups for test_fraction {test_fraction}"
         )
-    order = _by_size(counts, seed)
+    for name, count in counts.items():
+        if count < 1:
+            raise ValueError(f"group {name}: {count} rows: expected at least 1")
+    shuffled = sorted(
+        counts, key=lambda name: hashlib.sha256(f"{seed}/{name}".encode()).digest()
+    )
+    order = sorted(shuffled, key=lambda name: -counts[name])  # stable
     total = sum(counts.values())
     deficit = {TRAIN: (1.0 - test_fraction) * total, TEST: test_fraction * total}
     chosen: dict[str, list[str]] = {TRAIN: [], TEST: []}

@@ -15,17 +15,15 @@ from rcirl_jax.data.store.manifest import (
     ShardEntry,
     ShardInfo,
     array_table,
-    parse_manifest,
-    seal,
-)
-from rcirl_jax.data.store.rows import checked_leaves
-from rcirl_jax.data.store.shards import (
     describe,
     encode,
+    parse_manifest,
+    seal,
     shard_info,
     shard_key,
     verify_shard,
 )
+from rcirl_jax.data.store.rows import checked_leaves
 from rcirl_jax.errors import InputError, LostWorkError
 from rcirl_jax.types import Demonstration
 from rcirl_jax.units import TIMES_S

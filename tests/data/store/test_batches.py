@@ -19,7 +19,7 @@ from rcirl_jax.data.store.batches import (
 )
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.joined import JoinedDatasets
-from rcirl_jax.data.store.shards import BLOCK_ROWS
+from rcirl_jax.data.store.manifest import BLOCK_ROWS
 from tests.data.store.test_dataset import make_rows, write
 from tests.helpers.logs import refused
 

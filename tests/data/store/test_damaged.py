@@ -10,7 +10,7 @@ import pytest
 
 from rcirl_jax.data.store import manifest
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.data.store.shards import describe
+from rcirl_jax.data.store.manifest import describe
 from tests.data.store.test_dataset import SIZES, write
 from tests.helpers.logs import refused
 

@@ -34,23 +34,20 @@ def test_groups_are_whole_and_shares_off_by_the_largest_at_most(counts, fraction
     assert error <= max(counts.values()) + 1e-6
 
 
-def test_against_the_rule_done_by_hand():
-    # deficits start at 75 and 25: a 40 -> train (35), b 30 -> train (5),
-    # c 20 -> test (5), d 10 -> train, which wins the tie
-    counts = {"d": 10, "b": 30, "a": 40, "c": 20}
-    made = assign_groups(counts, test_fraction=0.25, seed=0)
-    assert made == {"train": ["a", "b", "d"], "test": ["c"]}
-
-
-def test_an_empty_split_takes_the_smallest_group():
-    assert assign_groups({"a": 9, "b": 7}, test_fraction=0.01, seed=0) == {
-        "train": ["a"],
-        "test": ["b"],
-    }
-    assert assign_groups({"a": 9, "b": 7}, test_fraction=0.99, seed=0) == {
-        "train": ["b"],
-        "test": ["a"],
-    }
+@pytest.mark.parametrize(
+    ("counts", "fraction", "train", "test"),
+    [
+        # deficits start at 75 and 25: a 40 -> train (35), b 30 -> train (5),
+        # c 20 -> test (5), d 10 -> train, which wins the tie
+        ({"d": 10, "b": 30, "a": 40, "c": 20}, 0.25, "abd", "c"),
+        # an empty split takes the smallest group
+        ({"a": 9, "b": 7}, 0.01, "a", "b"),
+        ({"a": 9, "b": 7}, 0.99, "b", "a"),
+    ],
+)
+def test_against_the_rule_done_by_hand(counts, fraction, train, test):
+    made = assign_groups(counts, test_fraction=fraction, seed=0)
+    assert made == {"train": list(train), "test": list(test)}
 
 
 def test_seed_decides_among_equals_by_sha256():

@@ -6,6 +6,7 @@ vehicle-disjoint group of its own.
 """
 
 import dataclasses
+import itertools
 import math
 import sys
 from collections.abc import Iterator
@@ -91,7 +92,29 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     settings["drivers"] = {**_table(spec, "drivers"), **_table(own, "drivers")}
     checked(settings, _File, path)
     drivers = driver_config(path, settings["drivers"])
-    jobs = _jobs(path, settings)
+    jobs = []  # (name, run) of every recording
+    for number, row in enumerate(settings["recordings"], start=1):
+        where = f"{path}: recordings[{number}]"
+        entry = checked(row, _Entry, where)
+        if entry.road not in ROADS:
+            raise InputError(
+                f"{where}: road: {entry.road}: expected one of {', '.join(ROADS)}"
+            )
+        if len(jobs) + entry.count > MAX_RECORDINGS:
+            raise InputError(
+                f"{where}: count: {entry.count} after {len(jobs)}: "
+                f"expected up to {MAX_RECORDINGS} of all entries"
+            )
+        for index in range(entry.count):
+            run = RunConfig(
+                road=entry.road,
+                duration_s=entry.duration_s,
+                density_veh_per_km=entry.density_veh_per_km,
+                seed=(entry.seed, index, TRAFFIC_STREAM),
+                rate_hz=float(settings["rate_hz"]),
+                warmup_s=float(settings["warmup_s"]),
+            )
+            jobs.append((f"{entry.road}-{number:02d}-{index:03d}", run))
     return (
         dataclasses.replace(validate_recording(made), progress=number / len(jobs))
         for number, made in enumerate(_simulated(jobs, drivers, settings), start=1)
@@ -124,51 +147,15 @@ def driver_config(path: Path, found: dict) -> DriverConfig:
     return made
 
 
-def _jobs(path: Path, settings: dict) -> list[tuple[str, RunConfig]]:
-    """(name, run) of every recording."""
-    jobs = []
-    for number, row in enumerate(settings["recordings"], start=1):
-        where = f"{path}: recordings[{number}]"
-        entry = checked(row, _Entry, where)
-        if entry.road not in ROADS:
-            raise InputError(
-                f"{where}: road: {entry.road}: expected one of {', '.join(ROADS)}"
-            )
-        if len(jobs) + entry.count > MAX_RECORDINGS:
-            raise InputError(
-                f"{where}: count: {entry.count} after {len(jobs)}: "
-                f"expected up to {MAX_RECORDINGS} of all entries"
-            )
-        for index in range(entry.count):
-            run = RunConfig(
-                road=entry.road,
-                duration_s=entry.duration_s,
-                density_veh_per_km=entry.density_veh_per_km,
-                seed=(entry.seed, index, TRAFFIC_STREAM),
-                rate_hz=float(settings["rate_hz"]),
-                warmup_s=float(settings["warmup_s"]),
-            )
-            jobs.append((f"{entry.road}-{number:02d}-{index:03d}", run))
-    return jobs
-
-
 def _simulated(
     jobs: list[tuple[str, RunConfig]], drivers: DriverConfig, settings: dict
 ) -> Iterator[Recording]:
     """Simulate neighbours of equal duration together, in the declared order."""
-    start = 0
-    while start < len(jobs):
-        duration = jobs[start][1].duration_s
-        end = start
-        while (
-            end < min(len(jobs), start + BATCH) and jobs[end][1].duration_s == duration
-        ):
-            end += 1
-        batch = jobs[start:end]
-        logs = simulate([run for _, run in batch], drivers)
-        for (name, run), log in zip(batch, logs, strict=True):
-            yield _recording(name, run, log, settings)
-        start = end
+    for _, alike in itertools.groupby(jobs, key=lambda job: job[1].duration_s):
+        while batch := list(itertools.islice(alike, BATCH)):
+            logs = simulate([run for _, run in batch], drivers)
+            for (name, run), log in zip(batch, logs, strict=True):
+                yield _recording(name, run, log, settings)
 
 
 def _recording(name: str, run: RunConfig, log: Log, settings: dict) -> Recording:

@@ -13,6 +13,7 @@ shoulder or parking strip), where drivers stop at their destination.
 import dataclasses
 import itertools
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -43,7 +44,6 @@ class Stop:
 class Road:
     """A road; arrays hold one value per GRID_M of station."""
 
-    name: str
     num_lanes: int
     lane_width: float  # m
     x: np.ndarray  # [g] m
@@ -170,7 +170,6 @@ Knots = list[tuple[float, float]]
 
 
 def _road(
-    name: str,
     length: float,
     knots: Knots,
     limits: Knots,
@@ -181,7 +180,6 @@ def _road(
     """A road from its curvature and limits.
 
     Args:
-      name: of the road.
       length: m.
       knots: (station m, curvature 1/m), linear in between; empty: straight.
       limits: (from station m, limit m/s).
@@ -197,7 +195,6 @@ def _road(
     chord = 0.5 * (heading[:-1] + heading[1:])
     starts, speeds = np.array(limits).T
     return Road(
-        name=name,
         num_lanes=3 if highway else 2,
         lane_width=HIGHWAY_LANE_M if highway else URBAN_LANE_M,
         x=np.concatenate([[0.0], np.cumsum(np.cos(chord) * GRID_M)]),
@@ -218,53 +215,33 @@ def _arc(start: float, clothoid: float, arc: float, kappa: float) -> Knots:
     return [*first, (end, kappa), (end + clothoid, 0.0)]
 
 
-def highway_straight() -> Road:
-    """1.1 km, three lanes, 30 m/s."""
-    return _road("highway_straight", 1100.0, [], [(0.0, 30.0)], highway=True)
-
-
-def highway_s_curve() -> Road:
-    """1.1 km, three lanes, bends of R = 500 m and 300 m, the limit falls."""
-    knots = _arc(150.0, 80.0, 180.0, 1 / 500.0) + _arc(560.0, 80.0, 150.0, -1 / 300.0)
-    limits = [(0.0, 27.8), (500.0, 22.2)]
-    return _road("highway_s_curve", 1100.0, knots, limits, highway=True)
-
-
-def arterial_signals() -> Road:
-    """800 m, two lanes, 60 km/h, traffic lights at 300 m and 580 m."""
-    lights = tuple(Stop(station=s, is_sign=False) for s in (300.0, 580.0))
-    return _road("arterial_signals", 800.0, [], [(0.0, 16.7)], stops=lights)
-
-
-def _turn(name: str, side: float, radius: float) -> Road:
+def _turn(side: float, radius: float) -> Road:
     """520 m, two lanes, 50 km/h, a right-angled bend with 10 m clothoids."""
     clothoid = 10.0
     arc = 0.5 * np.pi * radius - clothoid
-    knots = _arc(230.0, clothoid, arc, side / radius)
-    return _road(name, 520.0, knots, [(0.0, 13.9)])
-
-
-def urban_turn_left() -> Road:
-    """520 m, two lanes, 50 km/h, a left turn of 90 degrees with R = 18 m."""
-    return _turn("urban_turn_left", 1.0, 18.0)
-
-
-def urban_turn_right() -> Road:
-    """520 m, two lanes, 50 km/h, a right turn of 90 degrees with R = 22 m."""
-    return _turn("urban_turn_right", -1.0, 22.0)
-
-
-def stop_sign() -> Road:
-    """480 m, two lanes, 50 km/h, a stop sign at 260 m."""
-    sign = (Stop(station=260.0, is_sign=True),)
-    return _road("stop_sign", 480.0, [], [(0.0, 13.9)], stops=sign)
+    return _road(520.0, _arc(230.0, clothoid, arc, side / radius), [(0.0, 13.9)])
 
 
 ROADS: dict[str, Callable[[], Road]] = {
-    "highway_straight": highway_straight,
-    "highway_s_curve": highway_s_curve,
-    "arterial_signals": arterial_signals,
-    "urban_turn_left": urban_turn_left,
-    "urban_turn_right": urban_turn_right,
-    "stop_sign": stop_sign,
+    "highway_straight": partial(_road, 1100.0, [], [(0.0, 30.0)], highway=True),
+    # bends of R = 500 m and 300 m, the limit falls
+    "highway_s_curve": partial(
+        _road,
+        1100.0,
+        _arc(150.0, 80.0, 180.0, 1 / 500.0) + _arc(560.0, 80.0, 150.0, -1 / 300.0),
+        [(0.0, 27.8), (500.0, 22.2)],
+        highway=True,
+    ),
+    "arterial_signals": partial(
+        _road,
+        800.0,
+        [],
+        [(0.0, 16.7)],
+        stops=tuple(Stop(station=s, is_sign=False) for s in (300.0, 580.0)),
+    ),
+    "urban_turn_left": partial(_turn, 1.0, 18.0),
+    "urban_turn_right": partial(_turn, -1.0, 22.0),
+    "stop_sign": partial(
+        _road, 480.0, [], [(0.0, 13.9)], stops=(Stop(station=260.0, is_sign=True),)
+    ),
 }

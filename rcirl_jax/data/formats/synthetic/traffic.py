@@ -546,7 +546,11 @@ def _gain(
     others = np.where(has_new, new_after - new_now, 0.0)
     others += np.where(has_behind, old_after - old_now, 0.0)
     gain = mine_after - mine + state.driver["politeness"] * others
-    gain += _wish(state, table, side) - state.driver["threshold"]
+    # drivers near their destination work to the right
+    near = state.driver["destination"] - state.s < GO_RIGHT_M
+    near &= state.lane < table.num_lanes
+    wish = np.where(near, side * GO_RIGHT_MPS2, 0.0)
+    gain += wish - state.driver["threshold"]
     room = MIN_SIDE_GAP_M + SIDE_GAP_S * state.v
     room_behind = MIN_SIDE_GAP_M + SIDE_GAP_S * state.v[rows, new_behind]
     ahead = to_new_lead - 0.5 * (length + length[rows, new_lead])
@@ -554,13 +558,6 @@ def _gain(
     safe = exists & (ahead > room) & (mine_after > -OWN_BRAKING_MPS2)
     calm = (back > room_behind) & (new_after > -state.driver["safe"])
     return np.where(safe & (~has_new | calm), gain, -np.inf)
-
-
-def _wish(state: State, table: RoadTable, side: int) -> np.ndarray:
-    """Extra incentive of drivers near their destination, m/s^2."""
-    left = state.driver["destination"] - state.s
-    near = (left < GO_RIGHT_M) & (state.lane < table.num_lanes)
-    return np.where(near, side * GO_RIGHT_MPS2, 0.0)
 
 
 def pull_over(
@@ -636,40 +633,26 @@ def stop_acceleration(
     into = np.mod(seen + offsets[rows, state.next_stop], table.cycle)
     colour = (into >= table.green).astype(int) + (into >= table.green + table.yellow)
     demand = np.isfinite(gap) & (sign | (colour != GREEN))
-    _decide(state, gap, demand & ~sign, colour)
-    _wait(state, gap, demand & sign, dt)
-    demand &= ~state.committed & (gap < STOP_AHEAD_M)
-    near = np.where(demand, gap, 1.0)
-    bound = np.where(demand, line_acceleration(state.v, near, state.driver), np.inf)
-    return np.minimum(bound, _destination(state))
-
-
-def _decide(state: State, gap: np.ndarray, lit: np.ndarray, colour: np.ndarray) -> None:
-    """Yellow and red lights: brake or drive on."""
+    # yellow and red lights: brake or drive on
+    lit = demand & ~sign
     needed = state.v**2 / (2.0 * np.maximum(gap - 0.5, 0.1))
-    first = lit & ~state.decided
-    state.committed |= first & (needed > state.driver["dilemma"])
+    state.committed |= lit & ~state.decided & (needed > state.driver["dilemma"])
     state.committed &= lit & ~((colour == RED) & (needed < REVOKE_MPS2))
-    state.decided = lit.copy()
-
-
-def _wait(state: State, gap: np.ndarray, sign: np.ndarray, dt: float) -> None:
-    """Stop signs: count the time at the line; after `sign_wait` it is done."""
-    at_line = sign & (gap < AT_LINE_M) & (state.v < AT_REST_MPS) & state.alive
+    state.decided = lit
+    # stop signs: count the time at the line; after `sign_wait` it is done
+    at_line = demand & sign & (gap < AT_LINE_M) & (state.v < AT_REST_MPS) & state.alive
     state.stood = np.where(at_line, state.stood + dt, 0.0)
-    done = at_line & (state.stood >= state.driver["sign_wait"])
-    state.next_stop += done
-
-
-def _destination(state: State) -> np.ndarray:
-    """Bound [m/s^2] that brings the car to stand at its destination."""
+    state.next_stop += at_line & (state.stood >= state.driver["sign_wait"])
+    demand &= ~state.committed & (gap < STOP_AHEAD_M)
+    gap = np.where(demand, gap, 1.0)
+    bound = np.where(demand, line_acceleration(state.v, gap, state.driver), np.inf)
     left = state.driver["destination"] - state.s
     near = state.alive & (left < STOP_AHEAD_M)
     state.parked |= near & (np.abs(left) < ARRIVED_M) & (state.v < AT_REST_MPS)
     # the line is placed so that the gap left to it is used up at the destination
-    gap = np.where(near, left + state.driver["line_gap"], 1.0)
-    bound = line_acceleration(state.v, np.maximum(gap, 0.05), state.driver)
-    return np.where(near, bound, np.inf)
+    gap = np.maximum(np.where(near, left + state.driver["line_gap"], 1.0), 0.05)
+    at_destination = line_acceleration(state.v, gap, state.driver)
+    return np.minimum(bound, np.where(near, at_destination, np.inf))
 
 
 # ------------------------------------------------------------------ simulation
@@ -683,8 +666,8 @@ class RunConfig:
     duration_s: float  # s, length of the recording
     density_veh_per_km: float  # vehicles per km and lane, at the speed limit
     seed: tuple[int, ...]  # of the recording's random stream
-    rate_hz: float = 10.0  # samples per second
-    warmup_s: float = 30.0  # s simulated before the recording starts
+    rate_hz: float  # samples per second
+    warmup_s: float  # s simulated before the recording starts
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -835,14 +818,15 @@ class Traffic:
         """Vehicles at the road's end; their last destination is kept."""
         state = self.state
         gone = state.alive & (state.s > self.table.length - EXIT_M)
-        for r, slot in zip(*np.nonzero(gone), strict=True):
-            self._keep_destination(r, slot)
-            state.vehicle[r, slot] = -1
+        self.keep_destinations(gone)
+        state.vehicle[gone] = -1
 
-    def _keep_destination(self, r: int, slot: int) -> None:
-        number = self.state.vehicle[r, slot]
-        place = self.state.driver["destination"][r, slot]
-        self.sources[r].pool["destination"][number] = place
+    def keep_destinations(self, of: np.ndarray) -> None:
+        """Write back the destinations that drivers `of` [R, N] hold or gave up."""
+        for r, slot in zip(*np.nonzero(of), strict=True):
+            number = self.state.vehicle[r, slot]
+            place = self.state.driver["destination"][r, slot]
+            self.sources[r].pool["destination"][number] = place
 
     # --------------------------------------------------------------- motion
 
@@ -873,19 +857,6 @@ class Traffic:
         limit, curve = self.table.limit[rows, grid], self.table.curve[rows, grid]
         return desired_speed(self.state.driver, limit, curve, stretch)
 
-    def _profile(self, stretch: np.ndarray) -> np.ndarray:
-        """Bound [m/s^2] that keeps to a falling desired speed: curves, limits.
-
-            (v_des(s + v P) - v) / P,  at least -b,  P = PREVIEW_S
-
-        It follows a profile of constant braking without lag; the IDM's free term
-        alone lags behind it.
-        """
-        state = self.state
-        ahead = self._desired(state.s + PREVIEW_S * state.v, stretch)
-        bound = (ahead - state.v) / PREVIEW_S
-        return np.maximum(bound, -state.driver["deceleration"])
-
     def _wish(
         self, around: Neighbours, desired: np.ndarray, stretch: np.ndarray
     ) -> np.ndarray:
@@ -895,7 +866,11 @@ class Traffic:
         gap, leader_v = self._perceive(leader, distance, stretch)
         wish = idm_acceleration(state.v, desired, gap, leader_v, driver)
         stops = stop_acceleration(state, self.table, self.offsets, self.clock, self.dt)
-        bounds = np.minimum(stops, self._profile(stretch))
+        # keep to a falling desired speed, of curves and limits, by a profile of
+        # constant braking without lag; the IDM's free term alone lags behind it
+        ahead = self._desired(state.s + PREVIEW_S * state.v, stretch)
+        profile = (ahead - state.v) / PREVIEW_S
+        bounds = np.minimum(stops, np.maximum(profile, -driver["deceleration"]))
         wish = np.minimum(wish, bounds) + self._noise()
         wish = np.clip(wish, -self.config.emergency_mps2, driver["acceleration"])
         idle = wish < START_SHARE * driver["acceleration"]
@@ -957,11 +932,6 @@ class Traffic:
         state.phase = np.minimum(state.phase + rate * moved, 1.0)
         state.s, state.v = state.s + moved, v
 
-    def destinations(self) -> None:
-        """Write back the destinations that drivers still hold or gave up."""
-        for r, slot in zip(*np.nonzero(self.state.alive), strict=True):
-            self._keep_destination(r, slot)
-
 
 def simulate(runs: Sequence[RunConfig], config: DriverConfig) -> list[Log]:
     """Simulate recordings of equal duration, warm-up and rate together.
@@ -981,26 +951,22 @@ def simulate(runs: Sequence[RunConfig], config: DriverConfig) -> list[Log]:
     for _ in range(int(round(runs[0].duration_s * runs[0].rate_hz))):
         state = traffic.state
         offset, slope = state.lateral(traffic.table)
-        now = (state.vehicle.copy(), state.s.copy(), state.v.copy())
-        rows.append((*now, offset, slope))
+        now = (state.vehicle, state.s, state.v)
+        rows.append((*(x.copy() for x in now), offset, slope))
         for _ in range(traffic.substeps):
             traffic.step()
-    traffic.destinations()
-    columns = [np.stack(column) for column in zip(*rows, strict=True)]
-    vehicle, s, v, l, slope = columns
-    logs = []
-    for r, source in enumerate(traffic.sources):
-        n = source.capacity
-        logs.append(
-            Log(
-                road=traffic.roads[r],
-                vehicle=vehicle[:, r, :n],
-                s=s[:, r, :n],
-                l=l[:, r, :n],
-                slope=slope[:, r, :n],
-                v=v[:, r, :n],
-                drivers=source.pool[: source.used],
-                signal_offset=source.signal_offset,
-            )
+    traffic.keep_destinations(traffic.state.alive)
+    vehicle, s, v, l, slope = map(np.stack, zip(*rows, strict=True))
+    return [
+        Log(
+            road=source.road,
+            vehicle=vehicle[:, r, : source.capacity],
+            s=s[:, r, : source.capacity],
+            l=l[:, r, : source.capacity],
+            slope=slope[:, r, : source.capacity],
+            v=v[:, r, : source.capacity],
+            drivers=source.pool[: source.used],
+            signal_offset=source.signal_offset,
         )
-    return logs
+        for r, source in enumerate(traffic.sources)
+    ]
