@@ -29,7 +29,11 @@ def recognised_format(path: Path | None, source: Path | None = None) -> str:
     if not path.exists():
         raise InputError(f"{path}: input: missing: expected a file or folder")
     found: dict[str, Path] = {}
-    for file in itertools.islice(_candidates(path), MAX_FILES):
+    # the input, or what is in the folder: those whose names say most first
+    names = (name for form in IMPORTERS for name in format_of(form).names)
+    below = _matching(path, (*names, *TABLES)) if path.is_dir() else ()
+    possible = (file for file in below if file.is_dir() or is_input(path, file))
+    for file in itertools.islice(itertools.chain([path], possible), MAX_FILES):
         name = _format_of(file, source)
         if name:
             found.setdefault(name, file)
@@ -58,16 +62,6 @@ def recognised_format(path: Path | None, source: Path | None = None) -> str:
 
 def _matching(path: Path, patterns: tuple[str, ...]) -> Iterator[Path]:
     return itertools.chain.from_iterable(map(path.rglob, patterns))
-
-
-def _candidates(path: Path) -> Iterator[Path]:
-    """The input, or what is in the folder: those whose names say most first."""
-    yield path
-    if path.is_dir():
-        names = (name for form in IMPORTERS for name in format_of(form).names)
-        for found in _matching(path, (*names, *TABLES)):
-            if found.is_dir() or is_input(path, found):
-                yield found
 
 
 def _format_of(file: Path, source: Path | None) -> str:

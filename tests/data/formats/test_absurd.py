@@ -1,7 +1,6 @@
 """Numbers in range for a parser and absurd for a road; faults no check foresaw."""
 
 import dataclasses
-import importlib
 import os
 import subprocess
 import sys
@@ -13,8 +12,7 @@ from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.readers.tables import streams
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
-from tests.data.formats.fixtures import csv, levelx_highd, ngsim
-from tests.data.formats.writers import strict
+from tests.data.formats.fixtures import csv, format_of, modules
 from tests.helpers.logs import read, refused
 
 
@@ -23,42 +21,12 @@ def made(folder):
     return folder
 
 
-def replace_cell(file, row, column, value, separator=","):
-    """Overwrites one cell of a text table; the column by name or number."""
-    lines = file.read_text().splitlines()
-    place = column
-    if isinstance(column, str):
-        place = lines[0].split(separator).index(column)
-    cells = lines[row].split(separator)
-    cells[place] = value
-    lines[row] = separator.join(cells)
-    file.write_text("\n".join(lines) + "\n")
-
-
-def test_one_wrong_cell_does_not_make_a_lane_across_the_globe(tmp_path):
-    fixture = levelx_highd.write(made(tmp_path / "highd"))
-    (tracks,) = [f for f in fixture.files if f.name.endswith("_tracks.csv")]
-    replace_cell(tracks, 50, "x", "9e7")
-    line = refused(read, "levelx", fixture.input)
-    assert "x: 9e+07 m, the median is " in line
-    fixture = ngsim.write(made(tmp_path / "ngsim"))
-    replace_cell(fixture.files[0], 50, 5, "1e12", " ")
-    source = strict(tmp_path / "strict.toml", "ngsim")
-    line = refused(read, "ngsim", fixture.input, source)
-    assert "line 51: Local_Y: 1e+12: expected within 1e+08" in line
-
-
 WHOLE = ["interaction", "levelx_highd", "ngsim_pairs", "openacc"]
 
 
 def first_file(name, folder):
     """The first file of a sound log."""
-    module = importlib.import_module(f"tests.data.formats.fixtures.{name}")
-    return module.write(made(folder)).files[0]
-
-
-def importer_of(name):
-    return "levelx" if name.startswith("levelx") else name
+    return modules()[name].write(made(folder)).files[0]
 
 
 @pytest.mark.parametrize("name", WHOLE)
@@ -66,7 +34,7 @@ def test_a_log_that_is_held_whole_has_a_size(name, tmp_path):
     file = first_file(name, tmp_path / "in")
     with file.open("r+b") as opened:
         opened.truncate(2**40)  # its rows, and a terabyte of nothing
-    line = refused(read, importer_of(name), tmp_path / "in")
+    line = refused(read, format_of(name), tmp_path / "in")
     assert f"{file.name}: size: {2**20} MiB: expected 1024 at most" in line
 
 
@@ -85,7 +53,7 @@ def test_a_line_without_an_end_is_not_held(name, where, tmp_path, monkeypatch):
     if where == "cell":
         text = "".join(rows[:-1]) + 2**16 * " " + rows[-1]
     file.write_text(text)
-    line = refused(read, importer_of(name), tmp_path / "in")
+    line = refused(read, format_of(name), tmp_path / "in")
     assert file.name in line
     assert "a line of more than 16384 characters: expected one a row" in line
 

@@ -1,32 +1,15 @@
 """What no log says is counted: limits, widths of lanes, sizes of road users."""
 
-import collections
 import dataclasses
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.formats.perception import Boxes, on_clock, tracks_of
-from rcirl_jax.data.quality import assumed
 from rcirl_jax.types import Kind
 from tests.data.formats import people
-from tests.data.formats.test_conformance import MODULES, format_of, write
-
-
-def counts(recordings):
-    """(limits, widths, sizes) that are a guess."""
-    found = collections.Counter()
-    for recording in recordings:
-        found.update(assumed(recording))
-    return found["speed limit"], found["width"], found["size"]
-
-
-@pytest.mark.parametrize("name", sorted(MODULES))
-def test_of_every_format(name, tmp_path):
-    fixture = write(name, tmp_path)
-    assert counts(read_recordings(format_of(name), fixture.input)) == fixture.assumed
+from tests.data.formats.test_conformance import counts, write
 
 
 def test_what_the_users_own_toml_states_is_no_guess(tmp_path):

@@ -4,12 +4,16 @@ The formats are the modules of tests/data/formats/fixtures with a function `writ
 module named otherwise than its format says so by FORMAT.
 """
 
+import collections
+
 import numpy as np
 import pytest
 
 from rcirl_jax.data.formats import IMPORTERS, parts, read_part, read_recordings
+from rcirl_jax.data.formats.recognise import recognised_format
 from rcirl_jax.data.importing import ImportConfig, digest, import_logs
 from rcirl_jax.data.inputs import input_files
+from rcirl_jax.data.quality import assumed
 from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.scenes.config import CollectConfig
@@ -55,11 +59,8 @@ def sound(name, tmp_path_factory):
 def find(recordings, label, expected):
     """The track of this id, in the recording where it has as many samples."""
     found = [t for r in recordings for t in r.tracks if t.id == label]
-    known = sorted({t.id for r in recordings for t in r.tracks})
-    assert found, f"no track {label} among {known}"
     fitting = [track for track in found if track.t.size == expected.t.size]
-    sizes = [track.t.size for track in found]
-    assert fitting, f"track {label}: {sizes} samples, written {expected.t.size}"
+    assert fitting, (label, expected.t.size, [track.t.size for track in found])
     return fitting[0]
 
 
@@ -121,6 +122,20 @@ def test_every_recording_is_sound(sound):
             assert max(np.abs(track.x).max(), np.abs(track.y).max()) < 1e5
         for lane in recording.lanes:
             assert lane.centre.dtype == np.float64
+
+
+def counts(recordings):
+    """(limits, widths, sizes) that are a guess."""
+    found = collections.Counter()
+    for recording in recordings:
+        found.update(assumed(recording))
+    return found["speed limit"], found["width"], found["size"]
+
+
+def test_its_files_tell_the_format_and_what_they_do_not_say_is_counted(name, sound):
+    fixture, recordings = sound
+    assert recognised_format(fixture.input) == format_of(name)
+    assert counts(recordings) == fixture.assumed
 
 
 def test_lanes_lie_under_the_vehicles(sound):

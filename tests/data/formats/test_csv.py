@@ -9,16 +9,32 @@ from rcirl_jax.data.formats.lanes import StraightLane, straight_lanes
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import spec_root
 from rcirl_jax.types import Kind
+from tests.data.formats import people
 from tests.data.formats import writers as w
 from tests.data.formats.people import only, read
 
+COLUMNS = ("t", "id", "x", "y", "speed", "length", "width", "lane")
 
-def log(folder, rows=None, header=w.CSV_COLUMNS):
-    return w.table(folder / "log.csv", header, w.csv_rows() if rows is None else rows)
+
+def cars():
+    """Rows of three cars in lanes of their own."""
+    return [
+        [k / 10, f"car{n}", 10.0 * n + 1.5 * k, -3.5 * n, 15.0, 4.5, 1.8, f"lane{n}"]
+        for n in range(3)
+        for k in range(40)
+    ]
+
+
+def log(folder, rows=None, header=COLUMNS):
+    return w.table(folder / "log.csv", header, cars() if rows is None else rows)
+
+
+def spec(folder, columns=COLUMNS, **options):
+    return people.spec(folder, columns, **options)
 
 
 def test_rows_become_tracks_and_lanes(tmp_path):
-    recording = only(log(tmp_path), w.csv_spec(tmp_path / "s.toml"))
+    recording = only(log(tmp_path), spec(tmp_path))
     assert [track.id for track in recording.tracks] == ["car0", "car1", "car2"]
     track = recording.tracks[1]
     np.testing.assert_allclose(track.x, 10.0 + 1.5 * np.arange(40))
@@ -55,7 +71,7 @@ def test_units(tmp_path_factory, length, speed, clock, angle, origin):
     """Every unit, and clocks since 1970, give the same recording in SI."""
     folder = tmp_path_factory.mktemp("units")
     rows = []
-    for row in w.csv_rows():
+    for row in cars():
         t, name, x, y, v, box_length, box_width, lane = row
         k = round(t / 0.1)
         time = origin + k if clock[0] == "frame" else (origin + 0.1 * k) / clock[1]
@@ -66,8 +82,8 @@ def test_units(tmp_path_factory, length, speed, clock, angle, origin):
         rows[-1].append(0.02 / angle[1])
     units = [f'{field} = "{length[0]}"' for field in ("x", "y", "length", "width")]
     units += [f't = "{clock[0]}"', f'speed = "{speed[0]}"', f'heading = "{angle[0]}"']
-    columns = (*w.CSV_COLUMNS, "heading")
-    source = w.csv_spec(folder / "s.toml", columns=columns, units="\n".join(units))
+    columns = (*COLUMNS, "heading")
+    source = spec(folder, columns=columns, units="\n".join(units))
     track = only(log(folder, rows, columns), source).tracks[2]
     # a float64 clock since 1970 in ms resolves 0.2 us
     np.testing.assert_allclose(track.t, 0.1 * np.arange(40), atol=1e-6)
@@ -84,7 +100,7 @@ def test_heading_and_speed_from_positions(tmp_path):
     x, y = 50.0 * np.cos(angle), 50.0 * np.sin(angle)
     rows = [[*row, "c"] for row in zip(t.round(3), x, y, strict=True)]
     header = ("t", "x", "y", "id")
-    source = w.csv_spec(tmp_path / "s.toml", columns=header)
+    source = spec(tmp_path, columns=header)
     (track,) = only(log(tmp_path, rows, header), source).tracks
     np.testing.assert_allclose(track.speed[5:45], 15.0, rtol=0.01)
     np.testing.assert_allclose(track.heading[6:44], angle[6:44] + np.pi / 2, atol=0.01)
@@ -94,28 +110,26 @@ def test_heading_and_speed_from_positions(tmp_path):
 
 @pytest.mark.parametrize(("point", "shift"), [("front", -2.25), ("rear", 2.25)])
 def test_reference_point(tmp_path, point, shift):
-    source = w.csv_spec(tmp_path / "s.toml")
-    source.write_text(f'reference_point = "{point}"\n' + source.read_text())
+    source = spec(tmp_path, more=f'reference_point = "{point}"')
     np.testing.assert_allclose(only(log(tmp_path), source).tracks[0].x[0], shift)
 
 
 def test_turned_axis_and_named_kinds(tmp_path):
-    rows = [[r[0], r[1], r[2], -r[3], "PKW"] for r in w.csv_rows()]
+    rows = [[r[0], r[1], r[2], -r[3], "PKW"] for r in cars()]
     header = ("t", "id", "x", "right", "type")
     columns = {"t": "t", "id": "id", "x": "x", "y": "-right", "kind": "type"}
-    extra = '[kinds]\nPKW = "vehicle"\n'
-    source = w.csv_spec(tmp_path / "s.toml", columns=columns, extra=extra)
+    source = spec(tmp_path, columns, rest='PKW = "vehicle"')
     track = only(log(tmp_path, rows, header), source).tracks[2]
     np.testing.assert_allclose(track.y, -7.0)
     assert track.kind == Kind.VEHICLE
 
 
 def test_oncoming_lanes_run_the_other_way(tmp_path):
-    rows = w.csv_rows()
+    rows = cars()
     for row in rows:
         if row[1] == "car0":
             row[2] = 60.0 - row[2]
-    lanes = only(log(tmp_path, rows), w.csv_spec(tmp_path / "s.toml")).lanes
+    lanes = only(log(tmp_path, rows), spec(tmp_path)).lanes
     first, second, _ = lanes
     assert first.centre[0, 0] > first.centre[-1, 0]
     assert (first.left, first.right, second.left) == (None, None, None)
@@ -137,7 +151,7 @@ points = [[0.0, -3.5], [90.0, -3.5]]
 
 
 def test_lanes_of_the_mapping(tmp_path):
-    source = w.csv_spec(tmp_path / "s.toml", extra=LANES)
+    source = spec(tmp_path, rest=LANES)
     first, second = only(log(tmp_path), source).lanes
     assert (first.speed_limit, first.right, second.speed_limit) == (13.9, "2", None)
     np.testing.assert_array_equal(first.left_width, [1.5, 1.5])
@@ -147,7 +161,7 @@ def test_lanes_of_a_file(tmp_path):
     header = ("id", "x", "y", "width", "speed_limit", "successor")
     rows = [("a", 0, 0, 3, 10, "b"), ("a", 50, 0, 4, 10, "b"), ("b", 50, 0, 3, 9, "")]
     w.table(tmp_path / "lanes.csv", header, [*rows, ("b", 90, 5, 3, 9, "")])
-    source = w.csv_spec(tmp_path / "s.toml", extra='[lanes]\nfile = "lanes.csv"\n')
+    source = spec(tmp_path, rest='[lanes]\nfile = "lanes.csv"\n')
     log(tmp_path)
     first, second = only(tmp_path, source).lanes
     np.testing.assert_array_equal(first.left_width, [1.5, 2.0])
@@ -158,7 +172,7 @@ def test_example_mapping_reads_what_it_describes(tmp_path):
     header = "timestamp object east north yaw velocity length width class lane drive"
     rows = [
         [round(1000 * t), name, x, y, 0.0, 3.6 * v, length, width, "car", lane, "d1"]
-        for t, name, x, y, v, length, width, lane in w.csv_rows()
+        for t, name, x, y, v, length, width, lane in cars()
     ]
     source = spec_root() / "sources" / "csv_example.toml"
     recording = only(log(tmp_path, rows, header.split()), source)
@@ -167,75 +181,15 @@ def test_example_mapping_reads_what_it_describes(tmp_path):
     assert recording.notes == ()
 
 
-def scaled(column, factor):
-    return [
-        [value * factor if i == column else value for i, value in enumerate(row)]
-        for row in w.csv_rows()
-    ]
-
-
-@pytest.mark.parametrize(
-    ("rows", "field"),
-    [
-        (w.csv_rows(feet=1 / 0.3048), "feet taken for metres"),
-        (scaled(5, 1 / 0.3048), "length: median 14.8 m"),
-        (scaled(5, 0.3048), "length: median 1.4 m: expected 2 to 9 m; metres taken"),
-        (scaled(4, 3.6), "km/h taken for m/s"),
-        (scaled(4, 1 / 0.44704), "mph taken for m/s"),
-        (scaled(4, 0.0), "speed: 0 times"),
-        (scaled(0, 10.0), "t: median step 1: expected at most 0.55"),
-        (scaled(0, 2.0), "t: median step 0.2 s: expected 0.1 s"),
-        (scaled(6, 10.0), "width: 18 m"),
-        (scaled(4, 10.0), "speed: 150 m/s"),
-    ],
-)
-def test_malformed_rows(tmp_path, rows, field):
-    path = log(tmp_path, rows)
-    with pytest.raises(InputError) as error:
-        read(path, w.csv_spec(tmp_path / "s.toml"))
-    message = str(error.value)
-    assert message.startswith(str(path))
-    assert field in message
-    assert "\n" not in message
-
-
 def test_buses_are_no_feet(tmp_path):
     """Two of three are 12 m long, or all of two; three of three would be feet."""
-    rows, source = w.csv_rows(), w.csv_spec(tmp_path / "s.toml")
+    rows, source = cars(), spec(tmp_path)
     for row in rows:
         row[5] = 4.5 if row[1] == "car0" else 12.0
     found = only(log(tmp_path, rows), source)
     assert [track.length for track in found.tracks] == [4.5, 12.0, 12.0]
     found = only(log(tmp_path, [row for row in rows if row[1] != "car0"]), source)
     assert [track.length for track in found.tracks] == [12.0, 12.0]
-
-
-@pytest.mark.parametrize(
-    ("columns", "units", "extra", "field"),
-    [
-        ({"t": "t", "id": "id", "x": "x"}, "", "", "columns.y: missing"),
-        ({"t": "t", "id": "id", "x": "x", "y": "up"}, "", "", "column up: missing"),
-        ({"z": "z"}, "", "", "columns.z: unknown"),
-        (w.CSV_COLUMNS, 'x = "yard"', "", "units.x: yard"),
-        (w.CSV_COLUMNS, 'kind = "m"', "", "units.kind: unknown"),
-        (w.CSV_COLUMNS, "", 'length = "long"', "length: long"),
-        (
-            w.CSV_COLUMNS,
-            "",
-            '[[lanes]]\nid = "1"\npoints = [[0, 0]]',
-            "lanes 1: points",
-        ),
-        (w.CSV_COLUMNS, "", '[[lanes]]\npoints = [["a", 0]]', "expected numbers"),
-        (w.CSV_COLUMNS, "", '[lanes]\nfile = "none.csv"', "lanes.file: none.csv"),
-    ],
-)
-def test_malformed_mapping(tmp_path, columns, units, extra, field):
-    source = w.csv_spec(tmp_path / "s.toml", columns=columns, units=units, extra=extra)
-    header = [c for c in w.CSV_COLUMNS if c not in ("length", "width")]
-    rows = [[*row[:5], row[7]] for row in w.csv_rows()]
-    with pytest.raises(InputError) as error:
-        read(log(tmp_path, rows, header), source)
-    assert field in str(error.value)
 
 
 SI_COLUMNS = {
@@ -253,8 +207,8 @@ SI_COLUMNS = {
 @pytest.mark.dataset
 def test_recorded_ngsim_subset_in_si(data_dir, tmp_path):
     path = data_dir / "formats" / "ngsim_reference" / "ngsim_us101_subset_SIunits.csv"
-    source = w.csv_spec(tmp_path / "s.toml", columns=SI_COLUMNS, units='t = "ms"')
-    source.write_text('reference_point = "front"\n' + source.read_text())
+    more = 'reference_point = "front"'
+    source = spec(tmp_path, SI_COLUMNS, units='t = "ms"', more=more)
     found = {recording.name[-5:]: recording for recording in read(path, source)}
     assert len(found) == 2
     tracks = [track for recording in found.values() for track in recording.tracks]
@@ -278,9 +232,7 @@ def test_straight_lanes_longer_than_roads_are_not_made(tmp_path):
 
 
 def test_far_coordinates_get_a_local_origin(tmp_path):
-    rows = [
-        [r[0], r[1], r[2] + 691000.0, r[3] + 5334000.0, *r[4:]] for r in w.csv_rows()
-    ]
-    recording = only(log(tmp_path, rows), w.csv_spec(tmp_path / "s.toml"))
+    rows = [[r[0], r[1], r[2] + 691000.0, r[3] + 5334000.0, *r[4:]] for r in cars()]
+    recording = only(log(tmp_path, rows), spec(tmp_path))
     np.testing.assert_allclose(recording.tracks[0].x, 1.5 * np.arange(40))
     assert any("local origin" in note for note in recording.notes)

@@ -24,6 +24,14 @@ def headed(change, **options):
     return of(column(rows(0.5), "heading", change), **options)
 
 
+def scaled(factor, *names):
+    """The drive with columns in another unit than the TOML says."""
+    table = rows()
+    for name in names:
+        table = column(table, name, lambda value: value * factor)
+    return of(table)
+
+
 NUMBERED = [*enumerate(rows())]
 RAD, DEG = 'heading = "rad"', 'heading = "deg"'
 USUAL = 'heading_convention = "ccw_from_x"'
@@ -49,6 +57,27 @@ REFUSED = {
         rest='[table]\ndecimal = ","\nthousands = ","'
     ),
     "table.repeating: 9: expected up to 8": moved(rest="[table]\nrepeating = 9"),
+    # columns and lanes
+    "columns.y: missing": moved(columns=("t", "id", "x")),
+    "column up: missing": moved(columns={"t": "t", "id": "id", "x": "x", "y": "up"}),
+    "columns.z: unknown": moved(columns={"z": "z"}),
+    "units.x: yard": moved(units='x = "yard"'),
+    "units.kind: unknown": moved(units='kind = "m"'),
+    "length: long": moved(rest='[defaults]\nlength = "long"'),
+    "lanes 1: points": moved(rest='[[lanes]]\nid = "1"\npoints = [[0, 0]]'),
+    "expected numbers": moved(rest='[[lanes]]\npoints = [["a", 0]]'),
+    "lanes.file: none.csv": moved(rest='[lanes]\nfile = "none.csv"'),
+    # units and numbers that no road user has
+    "feet taken for metres": scaled(1 / 0.3048, "x", "y", "length"),
+    "length: median 14.8 m": scaled(1 / 0.3048, "length"),
+    "length: median 1.4 m: expected 2 to 9 m; metres taken": scaled(0.3048, "length"),
+    "km/h taken for m/s": scaled(3.6, "speed"),
+    "mph taken for m/s": scaled(1 / 0.44704, "speed"),
+    "speed: 0 times": scaled(0.0, "speed"),
+    "speed: 15": scaled(10.0, "speed"),
+    "t: median step 1: expected at most 0.55": scaled(10.0, "t"),
+    "t: median step 0.2 s: expected 0.1 s": scaled(2.0, "t"),
+    "width: 18 m": of([[*row, 18.0] for row in rows()], (*HEADER, "width")),
     # times
     "units.t: ms: the cells of t are such as '2024-05-20T10:00:00.000'": of(
         column(rows(), "t", ISO["ISO"]), units='t = "ms"'

@@ -61,6 +61,16 @@ def scenes_by_name(found):
     return scenes
 
 
+def assert_same_scenes(apart, whole, leaves=("s", "v", "a"), atol=2e-2):
+    assert set(apart) == set(whole)
+    for key, (scenes, row) in apart.items():
+        other, at = whole[key]
+        for leaf in leaves:
+            own, same = getattr(scenes.human, leaf)[row], getattr(other.human, leaf)[at]
+            np.testing.assert_allclose(own, same, atol=atol)
+        np.testing.assert_array_equal(scenes.decisions[row], other.decisions[at])
+
+
 @pytest.mark.parametrize("by_car", [False, True], ids=["by time", "by car"])
 def test_pieces_hold_the_scenes_of_the_whole(tmp_path, by_car):
     path = tmp_path / "log.csv"
@@ -70,7 +80,7 @@ def test_pieces_hold_the_scenes_of_the_whole(tmp_path, by_car):
     assert [made.name for made in pieces] == [f"log-{k:05d}" for k in range(4)]
     apart = scenes_by_name(pieces)
     assert len(whole) > 500
-    assert set(apart) == set(whole)
+    assert_same_scenes(apart, whole)
     assert any("#2" in name for name, _ in whole)
     sums_of = lambda made: (made.quality["tracks"], made.quality["states"])  # noqa: E731
     (one,) = cuts(path, spec)
@@ -81,13 +91,6 @@ def test_pieces_hold_the_scenes_of_the_whole(tmp_path, by_car):
         assert found == one.quality["dropped"].get(reason, 0)
     for key, (scenes, row) in apart.items():
         other, at = whole[key]
-        for leaf in ("s", "v", "a"):
-            np.testing.assert_allclose(
-                getattr(scenes.human, leaf)[row],
-                getattr(other.human, leaf)[at],
-                atol=2e-2,
-            )
-        np.testing.assert_array_equal(scenes.decisions[row], other.decisions[at])
         np.testing.assert_allclose(
             scenes.scene.path.l[row], other.scene.path.l[at], atol=1e-3
         )
@@ -108,14 +111,7 @@ def test_a_crowded_minute_is_several_pieces(tmp_path, monkeypatch):
     assert "log-00001.02" in names
     assert len(names) == len(set(names)) > 2 * len(minutes)
     whole, apart = scenes_by_name(minutes), scenes_by_name(windows)
-    assert set(apart) == set(whole)
-    for key, (scenes, row) in whole.items():
-        other, place = apart[key]
-        for name in ("s", "l", "v"):
-            np.testing.assert_allclose(
-                getattr(other.human, name)[place], getattr(scenes.human, name)[row],
-                atol=0.05,
-            )  # fmt: skip
+    assert_same_scenes(apart, whole, ("s", "l", "v"), 0.05)
     most = max(made.scenes.vehicle.size for made in windows if made.scenes is not None)
     assert most < 0.6 * max(made.scenes.vehicle.size for made in minutes)
     assert [made.progress for made in windows] == sorted(m.progress for m in windows)

@@ -189,9 +189,6 @@ def test_without_a_map_of_the_place_lanes_are_paths(dataset):
     assert len(read(dataset.parent, map="palo.pb")[0].lanes) == 4
 
 
-# ------------------------------------------------------------------- contents
-
-
 # ------------------------------------------------------------------- arrays
 
 BAD_METADATA = [

@@ -129,9 +129,15 @@ def test_speed_limits(tmp_path, monkeypatch, text, expected):
     assert lanes["30007"].speed_limit is None
 
 
-def test_speed_limit_of_the_lane_itself(tmp_path):
-    tags = {**osm.ROAD, "speed_limit": "30"}
-    one = {"1": (["middle_3"], ["border_3"], tags, [])}
+@pytest.mark.parametrize(
+    ("tags", "rules"), [({"speed_limit": "30"}, []), ({}, ["50000", "50002"])]
+)
+def test_the_limit_of_the_lane_itself_or_of_the_last_rule(
+    tmp_path, monkeypatch, tags, rules
+):
+    slow = ({"subtype": "speed_limit", "sign_type": "de274-30"}, [])
+    monkeypatch.setitem(osm.RULES, "50002", slow)
+    one = {"1": (["middle_3"], ["border_3"], {**osm.ROAD, **tags}, rules)}
     lanes, _ = read(metres(tmp_path, lanelets=one))
     assert lanes["1"].speed_limit == pytest.approx(30 / 3.6)
 
@@ -210,11 +216,3 @@ def test_malformed(tmp_path, text, words):
     line = refused(read, path)
     assert line.startswith(str(path))
     assert words in line
-
-
-def test_limit_of_the_last_rule_counts(tmp_path, monkeypatch):
-    slow = ({"subtype": "speed_limit", "sign_type": "de274-30"}, [])
-    monkeypatch.setitem(osm.RULES, "50002", slow)
-    both = {"1": (["middle_3"], ["border_3"], osm.ROAD, ["50000", "50002"])}
-    lanes, _ = read(metres(tmp_path, lanelets=both))
-    assert lanes["1"].speed_limit == pytest.approx(30 / 3.6)

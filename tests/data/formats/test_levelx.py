@@ -83,15 +83,6 @@ def test_speed_limit(motorway, text, lane, default):
     assert recording.default_speed_limit == default
 
 
-@pytest.mark.parametrize(
-    "marks", ["8.51", "8.51;x", "12.59;8.51", "", "8.51;8.51", "nan;1"]
-)
-def test_markings(motorway, marks):
-    edit(motorway / "01_recordingMeta.csv", "8.51;12.59;16.43", marks)
-    with pytest.raises(InputError, match=r"01_recordingMeta.csv: upperLaneMarkings: '"):
-        read(motorway)
-
-
 # -------------------------------------------------------------- inD and sisters
 
 
@@ -231,20 +222,6 @@ def test_truncated_at_the_border_of_lines(junction, kept, found):
         f"{path}: {found} as in 07_tracksMeta.csv; truncated file? "
         "(of a sample, set partial = true in the source TOML)"
     )
-
-
-@pytest.mark.parametrize(
-    ("row", "other", "found"),
-    [
-        ("0,299,300", "1,300,300", "track 0: initialFrame: 0: expected 1"),
-        ("0,299,300", "0,300,300", "track 0: finalFrame: 299: expected 300"),
-        ("0,299,300", "0,299,299", "track 0: numFrames: 300: expected 299"),
-    ],
-)
-def test_lives_of_tracks(junction, row, other, found):
-    edit(junction / "data" / "07_tracksMeta.csv", row, other)
-    with pytest.raises(InputError, match=found):
-        read(junction)
 
 
 def test_a_part_of_the_rows_on_request(junction, tmp_path):

@@ -34,30 +34,31 @@ def test_native_text_in_metres_with_left_positive(tmp_path):
     assert first.t[0] == 0.0
 
 
-def test_lanes_are_numbered_from_the_left(tmp_path):
+def lanes_at(folder, places):
+    """Lanes of one car on each, at its Local_X [ft]."""
     rows = [
         row
-        for lane in (1, 2, 3)
-        for row in w.ngsim_rows(vehicle=lane, lane=lane, local_x=12.0 * lane - 6.0)
+        for lane, x in places.items()
+        for row in w.ngsim_rows(vehicle=lane, lane=lane, local_x=x)
     ]
-    lanes = {r.id: r for r in only(w.ngsim_text(tmp_path / "a.txt", rows)).lanes}
-    assert (lanes["2"].left, lanes["2"].right) == ("1", "3")
-    assert (lanes["1"].left, lanes["3"].right) == (None, None)
-    np.testing.assert_allclose(lanes["2"].centre[:, 1], -1.5 * LANE_M)
-    np.testing.assert_allclose(lanes["2"].left_width, 0.5 * LANE_M)
-    fronts = np.array([row[5] for row in rows]) * w.FOOT
-    assert lanes["2"].centre[0, 0] == pytest.approx(fronts.min() - 50.0)
-    assert lanes["2"].centre[-1, 0] == pytest.approx(fronts.max() + 50.0)
-    assert lanes["2"].speed_limit == 29.06
+    return only(w.ngsim_text(folder / "a.txt", rows)).lanes
+
+
+def test_lanes_are_numbered_from_the_left(tmp_path):
+    first, second, third = lanes_at(tmp_path, {1: 6.0, 2: 18.0, 3: 30.0})
+    assert (first.left, first.right, first.id) == (None, "2", "1")
+    assert (second.left, second.right) == ("1", "3")
+    assert (third.left, third.right) == ("2", None)
+    np.testing.assert_allclose(second.centre[:, 1], -1.5 * LANE_M)
+    np.testing.assert_allclose(second.left_width, 0.5 * LANE_M)
+    fronts = np.array([row[5] for row in w.ngsim_rows()]) * w.FOOT
+    assert second.centre[0, 0] == pytest.approx(fronts.min() - 50.0)
+    assert second.centre[-1, 0] == pytest.approx(fronts.max() + 50.0)
+    assert second.speed_limit == 29.06
 
 
 def test_bounds_lie_midway_between_unequal_lanes(tmp_path):
-    rows = [
-        row
-        for lane, x in {1: 6.0, 2: 18.0, 3: 31.0}.items()
-        for row in w.ngsim_rows(vehicle=lane, lane=lane, local_x=x)
-    ]
-    _, middle, last = only(w.ngsim_text(tmp_path / "a.txt", rows)).lanes
+    _, middle, last = lanes_at(tmp_path, {1: 6.0, 2: 18.0, 3: 31.0})
     np.testing.assert_allclose(middle.left_width, 6.0 * w.FOOT)
     np.testing.assert_allclose(middle.right_width, 6.5 * w.FOOT)
     np.testing.assert_allclose(last.left_width, 6.5 * w.FOOT)
@@ -65,13 +66,7 @@ def test_bounds_lie_midway_between_unequal_lanes(tmp_path):
 
 
 def test_ramps_at_one_place_are_no_neighbours(tmp_path):
-    places = {1: 6.0, 7: 78.0, 8: 79.0}
-    rows = [
-        row
-        for lane, x in places.items()
-        for row in w.ngsim_rows(vehicle=lane, lane=lane, local_x=x)
-    ]
-    lanes = only(w.ngsim_text(tmp_path / "a.txt", rows)).lanes
+    lanes = lanes_at(tmp_path, {1: 6.0, 7: 78.0, 8: 79.0})
     assert all(lane.left is None and lane.right is None for lane in lanes)
 
 

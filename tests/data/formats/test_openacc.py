@@ -108,11 +108,8 @@ def test_layouts_of_the_campaigns(tmp_path):
     names = [track.id for track in recording.tracks]
     assert names[:3] == ["1-Rexton", "2-Hyundai", "3-VW(GolfE)"]
     # who drives the leader is not said
-    assert [track.is_human(0.0, 40.0) for track in recording.tracks[:3]] == [
-        False,
-        False,
-        True,
-    ]
+    human = [track.is_human(0.0, 40.0) for track in recording.tracks[:3]]
+    assert human == [False, False, True]
     assert [track.length for track in recording.tracks[:3]] == [4.85, 4.6, 4.27]
     order = ("Time", "Speed", "E", "N", "Lon", "Lat", "Alt", "IVS")
     zala = {
@@ -133,11 +130,6 @@ def test_layouts_of_the_campaigns(tmp_path):
 def test_only_human_drives_are_demonstrations(tmp_path):
     """Car 2 is driven by its ACC: surroundings of cars 1 and 3."""
     recording = only(drive(tmp_path))
-    assert [track.id for track in recording.tracks][:3] == [
-        "1-Audi(A8)",
-        "2-Audi(A6)",
-        "3-BMW(X5)",
-    ]
     spans = [track.automated for track in recording.tracks[:3]]
     assert spans == [(), ((0.0, np.inf),), ()]
     all_of_them = only(drive(tmp_path), spec(tmp_path, 'drivers = "all"\n'))

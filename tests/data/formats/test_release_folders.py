@@ -49,13 +49,6 @@ def test_logs_called_alike_are_named_by_their_folders(name, tmp_path):
     }
 
 
-@pytest.mark.parametrize("name", ["openacc", "nuplan", "commonroad"])
-def test_flat_folders_are_as_the_files_alone(tmp_path, name):
-    log = modules()[name].write(tmp_path).files[0]
-    whole = [digest(one) for one in read_recordings(name, log.parent)]
-    assert whole == [digest(one) for one in read_recordings(name, log)]
-
-
 @pytest.mark.parametrize("name", sorted(modules()))
 def test_rests_of_unpacking_are_passed_over(tmp_path, name):
     """What a Mac's zip holds besides, in a folder of its own or beside the files."""

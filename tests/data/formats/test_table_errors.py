@@ -1,9 +1,8 @@
 """What is wrong with a data set's table is one line: file, row, field and value."""
 
-import importlib
-
 import pytest
 
+from tests.data.formats.fixtures import format_of, modules
 from tests.data.formats.writers import strict
 from tests.helpers.logs import read, refused
 
@@ -17,6 +16,7 @@ WRONG = {
         ("_tracks.csv", "\n1,1,", "\nx,1,", "line 2: frame: 'x': expected a finite"),
         ("_tracks.csv", "\n1,1,", "\n2,1,", "line 3: id 1: met twice in one frame"),
         ("_tracks.csv", "\n1,1,2.58", "\n1,1,nan", "line 2: x: 'nan'"),
+        ("_tracks.csv", "\n1,1,2.58", "\n1,1,9e7", "x: 9e+07 m, the median is "),
         ("_tracks.csv", "\n1,1,2.58", "\n1,1", "line 2: 24 cells: expected 25"),
         ("_tracksMeta.csv", "class", "type", "column class: missing"),
         ("_tracksMeta.csv", None, None, "input: missing: expected it beside 01_tracks"),
@@ -25,9 +25,22 @@ WRONG = {
         ("_recordingMeta.csv", "1,25,2", "1,25", "expected one of 15"),
         ("_recordingMeta.csv", ",-1.00,", ",fast,", "speedLimit: 'fast': expected a"),
         ("_recordingMeta.csv", None, None, "input: missing: expected it beside 01_"),
+        *[
+            ("_recordingMeta.csv", "8.51;12.59;16.43", marks, "upperLaneMarkings: '")
+            for marks in ("8.51", "8.51;x", "12.59;8.51", "", "8.51;8.51", "nan;1")
+        ],
+    ],
+    "ngsim": [
+        (
+            *("0415.txt", "18.0 20.0", "18.0 1e12"),
+            "line 1: Local_Y: 1e+12: expected within 1e+08",
+        ),
     ],
     "levelx": [
         ("_recordingMeta.csv", "xUtmOrigin", "xOrigin", "xUtmOrigin: 'missing'"),
+        ("_tracksMeta.csv", "0,299,300", "1,300,300", "0: initialFrame: 0: expected 1"),
+        ("_tracksMeta.csv", "0,299,300", "0,300,300", "0: finalFrame: 299: expected 3"),
+        ("_tracksMeta.csv", "0,299,300", "0,299,299", "0: numFrames: 300: expected 29"),
     ],
     "interaction": [
         ("vehicle_tracks_000.csv", "timestamp_ms", "time", "column timestamp_ms: mis"),
@@ -66,10 +79,9 @@ WRONG = {
     [(name, *case) for name, cases in WRONG.items() for case in cases],
 )
 def test_a_wrong_table_is_one_line(tmp_path, name, ending, old, new, words):
-    module = importlib.import_module(f"tests.data.formats.fixtures.{name}")
-    form = getattr(module, "FORMAT", name)
+    form = format_of(name)
     (tmp_path / "log").mkdir()
-    module.write(tmp_path / "log")
+    modules()[name].write(tmp_path / "log")
     (path,) = (tmp_path / "log").rglob(f"*{ending}")
     text = path.read_text()
     if old is None:

@@ -177,43 +177,9 @@ def table(path: Path, header, rows):
     return path
 
 
-CSV_COLUMNS = ("t", "id", "x", "y", "speed", "length", "width", "lane")
-
-
-def csv_rows(*, cars=3, count=40, feet=1.0):
-    """`cars` at SPEED in lanes of their own; `feet` scales positions and lengths."""
-    rows = []
-    for number in range(cars):
-        for k in range(count):
-            x, y = 10.0 * number + SPEED * DT * k, -3.5 * number
-            place = (x * feet, y * feet, SPEED, 4.5 * feet, 1.8)
-            rows.append([round(DT * k, 3), f"car{number}", *place, f"lane{number}"])
-    return rows
-
-
 def strict(path: Path, name: str):
     """The packaged source TOML of a format, by which no row may be bad."""
     text = (spec_root() / "sources" / f"{name}.toml").read_text()
     assert "max_bad_rows = 0.01" in text
     path.write_text(text.replace("max_bad_rows = 0.01", "max_bad_rows = 0.0"))
-    return path
-
-
-CSV_SPEC = """
-licence = "test"
-max_bad_rows = 0.0
-[columns]
-{columns}
-[units]
-{units}
-[defaults]
-rate_hz = 10.0
-"""
-
-
-def csv_spec(path: Path, *, columns=CSV_COLUMNS, units="", extra=""):
-    """Write a mapping of columns to themselves; `columns` may be a dict."""
-    mapping = columns if isinstance(columns, dict) else {c: c for c in columns}
-    lines = "\n".join(f'{field} = "{name}"' for field, name in mapping.items())
-    path.write_text(CSV_SPEC.format(columns=lines, units=units) + extra)
     return path

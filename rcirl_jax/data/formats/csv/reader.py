@@ -102,37 +102,32 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """
     for file in parts(path, spec):
         log = opened(file, spec)
-        for made in _recordings(log, is_long_file(file, spec)):
-            yield validate_recording(attach_row_stats(made, log.stats), file)
+        columns, own = log.columns, log_name(file, spec, own_name(file))
+        with rows_of(
+            log.table,
+            columns.fields,
+            log.stats,
+            is_long=is_long_file(file, spec),
+            distance=columns.distance,
+            is_clock=columns.is_clock,
+        ) as rows:
+            every = rows.recordings()
+            minutes = (log.placed(part) for one in every for part in rows.minutes(one))
+            automated = rows.texts_of("automated")
+            meaning = meaning_of(file, minutes, automated, columns, spec)
+            for recording in every:
+                name = own if recording is None else f"{own}-{recording}"
+                for part in rows.slices(recording, MAX_GAP_STEPS / columns.rate_hz):
+                    values = meaning.applied(log.placed(part.values))
+                    made = _recording(f"{name}{part.label}", values, log, meaning)
+                    made = attach_row_stats(part.of_log(name, made), log.stats)
+                    yield validate_recording(made, file)
 
 
 def opened(file: Path, spec: dict) -> Log:
     """Opens a file with its columns; none of its rows is read."""
     table, stats = open_log(file, spec)
     return Log(table=table, spec=spec, columns=columns_of(table, spec), stats=stats)
-
-
-def _recordings(log: Log, is_long: bool) -> Iterator[Recording]:
-    path, columns = log.table.path, log.columns
-    own = log_name(path, log.spec, own_name(path))
-    with rows_of(
-        log.table,
-        columns.fields,
-        log.stats,
-        is_long=is_long,
-        distance=columns.distance,
-        is_clock=columns.is_clock,
-    ) as rows:
-        every = rows.recordings()
-        minutes = (log.placed(part) for one in every for part in rows.minutes(one))
-        automated = rows.texts_of("automated")
-        meaning = meaning_of(path, minutes, automated, columns, log.spec)
-        for recording in every:
-            name = own if recording is None else f"{own}-{recording}"
-            for part in rows.slices(recording, MAX_GAP_STEPS / columns.rate_hz):
-                values = meaning.applied(log.placed(part.values))
-                made = _recording(f"{name}{part.label}", values, log, meaning)
-                yield part.of_log(name, made)
 
 
 def _recording(name: str, values: Rows, log: Log, meaning: Meaning) -> Recording:

@@ -78,8 +78,15 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
         rows, stats = _read(file, spec)
         scene, all_stats = _scene(file, spec), [stats]
         if np.isfinite(rows["case_id"]).any():
-            for made in _cases(rows, scene):
-                yield attach_row_stats(made, stats)
+            log = log_name(file, spec, file.stem)
+            order = np.argsort(rows["case_id"], kind="stable")
+            changes = np.flatnonzero(np.diff(rows["case_id"][order])) + 1
+            for at in np.split(order, changes):
+                case = {field: values[at] for field, values in rows.items()}
+                name = f"{log}-case{case['case_id'][0]:g}"
+                # all of a file are one group, they share vehicles
+                make = functools.partial(_recording, name, case, scene, file.stem)
+                yield attach_row_stats(accepted(make, name, file, spec), stats)
             continue
         partner = file.with_name(file.name.replace(VEHICLES, PEDESTRIANS, 1))
         if partner != file and partner.is_file():
@@ -207,18 +214,6 @@ def _is_numbered(one: str, other: str) -> bool:
     """Whether one of two names is the other with a number behind it."""
     short, long = sorted((one, other), key=len)
     return long.removeprefix(short).isdigit() and not short[-1:].isdigit()
-
-
-def _cases(table: Rows, scene: _Scene) -> Iterator[Recording]:
-    """One Recording per case; all of a file are one group, they share vehicles."""
-    order = np.argsort(table["case_id"], kind="stable")
-    case = table["case_id"][order]
-    for rows in np.split(order, np.flatnonzero(np.diff(case)) + 1):
-        part = {field: values[rows] for field, values in table.items()}
-        log = log_name(scene.path, scene.spec, scene.path.stem)
-        name = f"{log}-case{part['case_id'][0]:g}"
-        make = functools.partial(_recording, name, part, scene, scene.path.stem)
-        yield accepted(make, name, scene.path, scene.spec)
 
 
 def _recording(name: str, rows: Rows, scene: _Scene, group: str | None) -> Recording:

@@ -93,24 +93,6 @@ class _Meta:
             raise InputError(f"{self.path}: {field}: '{found}': expected a {kind}")
         return value
 
-    @property
-    def rate(self) -> float:
-        """Frames per second."""
-        rate = self.number("frameRate")
-        if not 1.0 <= rate <= 1000.0:
-            raise InputError(
-                f"{self.path}: frameRate: {rate:g}: expected 1 to 1000 1/s"
-            )
-        return rate
-
-    @property
-    def limit(self) -> float | None:
-        """The speed limit [m/s]; -1 stands for none."""
-        if self.cells.get("speedLimit", "").lower() in ("", "nan"):
-            return None
-        limit = self.number("speedLimit")
-        return limit if limit > 0.0 else None
-
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """Returns XX_tracks.csv at any depth of a folder: releases keep them in data/."""
@@ -150,7 +132,13 @@ def _recording(table: Table, spec: dict, stats: RowStats) -> Recording:
     direction = "drivingDirection" if is_corner else None
     users = _read_users(_beside(path, USERS), columns.get("id", "id"), direction)
     meta = _read_meta(_beside(path, META))
-    rate, limit = meta.rate, meta.limit
+    rate = meta.number("frameRate")
+    if not 1.0 <= rate <= 1000.0:
+        raise InputError(f"{meta.path}: frameRate: {rate:g}: expected 1 to 1000 1/s")
+    limit = None
+    if meta.cells.get("speedLimit", "").lower() not in ("", "nan"):
+        found = meta.number("speedLimit")
+        limit = found if found > 0.0 else None  # -1 stands for none
     rows["t"] = (rows["frame"] - rows["frame"].min()) / rate
     rows["speed"] = np.hypot(rows["vx"], rows["vy"])
     if is_corner:
