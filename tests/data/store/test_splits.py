@@ -39,7 +39,7 @@ def test_groups_are_whole_and_shares_off_by_the_largest_at_most(counts, fraction
     [
         # deficits start at 75 and 25: a 40 -> train (35), b 30 -> train (5),
         # c 20 -> test (5), d 10 -> train, which wins the tie
-        ({"d": 10, "b": 30, "a": 40, "c": 20}, 0.25, "abd", "c"),
+        ({"d": 10, "b": 30, "a": 40, "c": 20}, 0.25, ("a", "b", "d"), "c"),
         # an empty split takes the smallest group
         ({"a": 9, "b": 7}, 0.01, "a", "b"),
         ({"a": 9, "b": 7}, 0.99, "b", "a"),
