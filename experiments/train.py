@@ -17,7 +17,7 @@ from rcirl_jax.export.from_run import export_run
 from rcirl_jax.reward import LOSSES
 from rcirl_jax.reward.network import CONSTRAINTS, PINS
 from rcirl_jax.sampling import SamplerConfig
-from rcirl_jax.sampling.config import MODES
+from rcirl_jax.sampling.sampler import MODES
 from rcirl_jax.train.loop import Running, train
 from rcirl_jax.train.parallel import PARALLEL
 from rcirl_jax.train.state import LEARNED_FUTURES, POSITIVES, TrainConfig
