@@ -29,7 +29,7 @@ from absl import app, flags
 from benchmarks.common import dataset_or_synthetic, in_turn, write
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.evaluation.ranking.learners import normaliser_of
-from rcirl_jax.evaluation.ranking.sweep import MEMBERS_AT_ONCE
+from rcirl_jax.export.sweep import MEMBERS_AT_ONCE
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.runtime.compiling import compiles
 from rcirl_jax.train.featurise import host_batch

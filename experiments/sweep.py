@@ -13,8 +13,7 @@ from pathlib import Path
 from absl import flags
 
 from rcirl_jax.cli.running import provenance, run
-from rcirl_jax.evaluation.ranking.sweep import CHOICES, SweepConfig
-from rcirl_jax.export.sweep import run_sweep, table
+from rcirl_jax.export.sweep import CHOICES, SweepConfig, run_sweep, table
 from rcirl_jax.reward import LOSSES
 from rcirl_jax.runtime.executors import make_executor
 from rcirl_jax.train.state import LEARNED_FUTURES, POSITIVES, TrainConfig

@@ -146,7 +146,7 @@ def _of_sweep(folder: Path) -> Facts:
     report = json.loads((folder / "sweep" / "sweep.json").read_text())
     for member in report["members"].values():
         del member["sha256"]  # of a file that says when it was made
-    del report["groups"], report["peak_memory_gib"]  # seconds, compiles, memory
+    del report["groups"]  # seconds, compiles
     del report["made_by"]["created"]
     return {"sweep.json": digest(report), **_weights_below(folder / "sweep")}
 

@@ -24,8 +24,7 @@ from rcirl_jax.cli import flags as shared
 from rcirl_jax.cli.flags import AS_SAID, floats, hidden_sizes
 from rcirl_jax.cli.running import provenance
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.ranking.sweep import CHOICES, SweepConfig
-from rcirl_jax.export.sweep import run_sweep, table
+from rcirl_jax.export.sweep import CHOICES, SweepConfig, run_sweep, table
 from rcirl_jax.train.state import TrainConfig
 
 LEAKY_RATES = (0.01, 0.05, 0.2)

@@ -1,442 +1,468 @@
-"""A sweep in its folder: trained, resumed, searched, chosen, written, read again.
+"""Sweeps: networks, leaky rates, step sizes and seeds, a grid or proposed by Optuna.
 
-DIR/stages.json           the groups that are finished, and what they were made from
-DIR/weights/NAME.msgpack  every member
-DIR/groups/SHAPE.json     how the members of a group trained (a search: of a round)
-DIR/sweep.json            all members with their metrics, and the choice
-DIR/best.msgpack          the chosen member, a copy of its file
+A point is a configuration without its seed, a member one with it. Members with one
+network shape train side by side in one compiled program (`train.sweep`); such a group
+is the piece of work that goes to an executor, and nothing depends on where it ran.
 
-A search tries configurations that Optuna proposes within the bounds of the grid's axes:
-it proposes a round of them, they train side by side as a grid's do, and it learns their
-values on the validation scenes before it proposes the next round.
+The training split is cut into scenes to fit and scenes to choose by, by group of
+vehicles or by vehicle (`data.store.resplit.with_validation`). A point is judged by the
+mean of its seeds on the validation scenes. The test split is scored afterwards, for the
+chosen point alone, so nothing can be chosen by it.
+
+    DIR/stages.json           the groups that are finished, and what they were made from
+    DIR/weights/NAME.msgpack  every member
+    DIR/groups/SHAPE.json     how the members of a group trained (a search: of a round)
+    DIR/sweep.json            all members with their metrics, and the choice
+    DIR/best.msgpack          the chosen member, a copy of its file
 """
 
-import collections
 import dataclasses
 import datetime
 import functools
+import itertools
 import json
 import math
-import resource
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import tqdm
 
-from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.joined import Demonstrations, open_datasets
+from rcirl_jax.data.store.resplit import Resplit, subsample, with_validation
 from rcirl_jax.errors import MALFORMED, InputError, extra_module
 from rcirl_jax.evaluation.baselines import new_study
-from rcirl_jax.evaluation.ranking.evaluate import covered_rows
-from rcirl_jax.evaluation.ranking.metrics import METRICS
-from rcirl_jax.evaluation.ranking.sweep import (
-    Hidden,
-    Part,
-    Point,
-    Scores,
-    SweepConfig,
-    best,
-    estimates,
-    held_out_scores,
-    member_name,
-    open_split,
-    point_name,
-    row_name,
-    seed_means,
-    shape_name,
-    train_group,
+from rcirl_jax.evaluation.ranking.evaluate import (
+    RankingSetup,
+    covered_rows,
+    numbered,
+    outcomes_of,
+    score_rows,
 )
-from rcirl_jax.evaluation.statistics import ClusterBootstrap
+from rcirl_jax.evaluation.ranking.learners import fitting_rows, normaliser_of
+from rcirl_jax.evaluation.ranking.metrics import METRICS, scene_metrics
+from rcirl_jax.evaluation.statistics import ClusterBootstrap, combine_seeds
 from rcirl_jax.export.from_run import verification_samples, write_weights
 from rcirl_jax.export.loading import compiled_scorer, open_reward
+from rcirl_jax.features import feature_map
+from rcirl_jax.reward import Normaliser, seen_range
 from rcirl_jax.runtime.atomic_files import read_json, write_json, write_whole
+from rcirl_jax.runtime.compiling import compiles
 from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.runtime.pipeline import FILE, Stages, code_sha256, only_one
-from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.train.state import FeatureBatch, TrainConfig
+from rcirl_jax.train.sweep import PROGRAM, Fitted, fit, freeze, members_of
 
 SWEEP = "sweep.json"  # in the sweep's folder
-ELSEWHERE = ("data", "trials", "points")  # fields that are no settings of a folder
-ROUND = 8  # configurations of a round
+NO_SETTINGS = ("data", "trials")  # where data lie, and how far a search has come
+MOST_MEMBERS = 100_000  # of a sweep
+MEMBERS_AT_ONCE = 16  # per call: enough to share the scenes, few enough to see progress
+ROUND = 8  # points of a search that train together
 DIGITS = 3  # of a proposed rate: more would tell nothing, and lengthen names
-Rows = Mapping[str, Sequence[TrainConfig]]  # configuration -> its members
-# (name of a split, rows) -> their metrics, and the vehicles of the scenes
-Judge = Callable[[str, Rows], tuple[Scores, ClusterBootstrap]]
+CHOICES = tuple(name for name, how in METRICS.items() if how.compared)
+# a likelihood needs a temperature of its own, which no choice here depends on
+REPORTED = tuple(name for name in METRICS if name != "nll")
+
+Hidden = tuple[int, ...]  # units of the hidden layers; () is linear
+Name = TypeVar("Name")
+
+
+def shape_name(hidden: Hidden) -> str:
+    """Returns a network shape in words: "15", "32x16", "linear"."""
+    return "x".join(map(str, hidden)) or "linear"
+
+
+class Point(NamedTuple):
+    """A configuration without its seed."""
+
+    hidden: Hidden
+    leaky_rate: float
+    learning_rate: float
+
+    @property
+    def name(self) -> str:
+        """As in file names and tables."""
+        rates = f"a{self.leaky_rate:g}_r{self.learning_rate:g}"
+        return f"h{shape_name(self.hidden)}_{rates}"
+
+    def as_json(self) -> dict[str, object]:
+        """As in sweep.json."""
+        return {**self._asdict(), "hidden": shape_name(self.hidden)}
+
+
+def member_name(member: TrainConfig) -> str:
+    """Returns a point's name with the seed."""
+    point = Point(member.reward.hidden, member.leaky_rate, member.learning_rate)
+    return f"{point.name}_s{member.seed}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Found:
-    """Trained members, with their values on the validation split; all by name."""
+class SweepConfig:
+    """Everything that decides the result of a sweep; hashable and small."""
 
-    rows: Rows
-    groups: Mapping[str, dict]  # how each trained, in numbers
-    members: Mapping[str, dict]
-    configurations: Mapping[str, dict]
+    # datasets that every worker can open
+    data: tuple[str, ...]
+    # what the members share; its seed draws splits, candidates and batches
+    base: TrainConfig
+    hidden_sizes: tuple[Hidden, ...]
+    leaky_rates: tuple[float, ...]
+    learning_rates: tuple[float, ...]
+    # training runs of each point, with seeds 0, 1, ...
+    seeds: int
+    # share of the training scenes to choose by
+    validation: float = 0.2
+    # training scenes used at most, drawn by vehicle (0: all)
+    scenes: int = 0
+    # metric of the choice
+    choose_by: str = "top1_fde"
+    # s at which distances are taken
+    horizon_s: float = 5.0
+    # points that Optuna proposes within the grid's bounds (0: the whole grid)
+    trials: int = 0
 
-    def value(self, row: str, metric: str) -> float:
-        """Of a configuration, the mean of its seeds; NaN where one did not train."""
-        known = self.configurations[row]
-        return known["validation"][metric]["value"] if known["finite"] else math.nan
-
-    def beside(self, other: "Found") -> "Found":
-        """These and those of another."""
-        return Found(
-            rows={**self.rows, **other.rows},
-            groups={**self.groups, **other.groups},
-            members={**self.members, **other.members},
-            configurations={**self.configurations, **other.configurations},
+    def __post_init__(self) -> None:
+        """Reject values out of range, and what is no grid of a weights file's."""
+        count, axes = math.prod(map(len, self.axes.values())), self.axes.values()
+        rules = (
+            ("choose_by", self.choose_by in CHOICES, f"one of {CHOICES}"),
+            ("validation", 0.0 < self.validation <= 0.5, "0 to 0.5"),
+            ("horizon_s", 0.0 < self.horizon_s <= 8.0, "above 0, at most 8 s"),
+            ("seeds", self.seeds >= 1, ">= 1"),
+            ("scenes", self.scenes >= 0, ">= 0"),
+            ("trials", self.trials >= 0, ">= 0"),
+            *((n, len(axis) > 0, "one value or more") for n, axis in self.axes.items()),
+            (
+                "leaky_rates",
+                self.base.loss == "rank" or len(self.leaky_rates) == 1,
+                "one value: only loss=rank has a leaky rate",
+            ),
+            (
+                "trials",
+                not self.trials or any(len(set(axis)) > 1 for axis in axes),
+                "two values or more of leaky_rates, learning_rates or hidden_sizes: "
+                "bounds to search in",
+            ),
+            (
+                "seeds",
+                max(count, self.trials) * self.seeds <= MOST_MEMBERS,
+                f"a sweep of at most {MOST_MEMBERS} trainings",
+            ),
         )
+        for name, holds, expected in rules:
+            if not holds:
+                raise InputError(f"{name}: {getattr(self, name)}: expected {expected}")
+        self.base.reward.check_own()
+        names = [member_name(one) for at in self.grid for one in self.members(at)]
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise InputError(f"sweep: {twice}: twice: expected distinct values")
+
+    @property
+    def axes(self) -> dict[str, tuple]:
+        """The grid's axes, in the order of `Point`."""
+        names = ("hidden_sizes", "leaky_rates", "learning_rates")
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def grid(self) -> list[Point]:
+        """All points of the grid, shape by shape."""
+        return list(itertools.starmap(Point, itertools.product(*self.axes.values())))
+
+    def shared(self, hidden: Hidden) -> TrainConfig:
+        """What all members of a group share."""
+        reward = dataclasses.replace(self.base.reward, hidden=hidden)
+        return dataclasses.replace(self.base, reward=reward)
+
+    def members(self, point: Point) -> list[TrainConfig]:
+        """The members of a point, seed by seed."""
+        rates = {"leaky_rate": point.leaky_rate, "learning_rate": point.learning_rate}
+        shared = dataclasses.replace(self.shared(point.hidden), **rates)
+        return [dataclasses.replace(shared, seed=seed) for seed in range(self.seeds)]
+
+    def as_json(self) -> dict:
+        """What decides the result; more trials go on where fewer ended."""
+        made = json.loads(json.dumps(dataclasses.asdict(self)))
+        kept = {n: value for n, value in made.items() if n not in NO_SETTINGS}
+        return {**kept, "search": "optuna" if self.trials else "grid"}
 
 
-def run_sweep(
-    config: SweepConfig,
-    folder: Path,
-    executor: Executor,
-    provenance: Mapping[str, object],
-) -> dict:
-    """Train what is not there yet, choose, score the chosen, write everything.
-
-    Args:
-      config: the sweep.
-      folder: its folder; a finished group in it is not trained again.
-      executor: where groups train and scenes are scored.
-      provenance: what makes it; kept in every file.
-
-    Returns:
-      The contents of sweep.json.
-
-    Raises:
-      InputError: the folder belongs to other settings or data, or is in use; bad
-        data; no configuration that trains.
-    """
-    opened = open_split(config)
-    with only_one(folder):
-        return _sweep(config, folder, executor, provenance, opened)
+def open_split(
+    config: SweepConfig, *, verify: bool = True
+) -> tuple[Demonstrations, Resplit, str]:
+    """Returns all data, splits train, validation, test, and what the cut goes by."""
+    dataset = open_datasets(config.data, verify=verify)
+    seed = config.base.seed
+    part = subsample(dataset, config.scenes, seed) if config.scenes else dataset
+    return dataset, *with_validation(part, config.validation, seed)
 
 
-def _sweep(
-    config: SweepConfig,
-    folder: Path,
-    executor: Executor,
-    provenance: Mapping[str, object],
-    opened: tuple[Demonstrations, Demonstrations, str],
-) -> dict:
-    """`run_sweep` in a folder that is this sweep's alone."""
-    dataset, split, by = opened
-    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    made_by = {**provenance, "dataset_sha256": dataset.hash, "created": now}
-    for name in ("validation", "test"):  # what would fail only after the training
-        held_out, _ = covered_rows(split, name, config.setup.horizon_s)
-        ClusterBootstrap(np.asarray(held_out.vehicle))
-    judge = functools.partial(scores_of, config, folder, split, executor)
-
-    def trained(points: tuple[Point, ...] = (), number: int = 0) -> Found:
-        part = dataclasses.replace(config, points=points)
-        groups = _train(part, folder, split, executor, made_by, number)
-        return validated(part, groups, judge)
-
-    found = searched(config, trained) if config.trials else trained()
-    body = {
-        "settings": settings_of(config),
-        "search": "optuna" if config.trials else "grid",
-        "validation_by": by,
-        "scenes": {n: split.indices(n).size for n in ("train", "validation", "test")},
-        **choice(config, found, judge),
-        "peak_memory_gib": _peak_memory_gib(),
-        "made_by": made_by,
-    }
-    chosen = folder / "weights" / f"{body['chosen']['member']}.msgpack"
-    write_whole(folder / "best.msgpack", chosen.read_bytes())
-    write_json(folder / SWEEP, body)
-    return body
+# ------------------------------------------------------------------ what to try
 
 
-def _train(
-    config: SweepConfig,
-    folder: Path,
-    split: Demonstrations,
-    executor: Executor,
-    made_by: Mapping[str, object],
-    number: int,
-) -> dict[str, dict]:
-    """The groups' files by name, after training those that are missing.
+def rounds(
+    config: SweepConfig, values: Mapping[Point, float]
+) -> Iterator[tuple[int, list[Point]]]:
+    """Yields what trains together: the whole grid, or what Optuna proposes next.
 
-    Groups of a search's round bear its number, from 1.
-    """
-    stages, settings = Stages(folder=folder), settings_of(config)
-    settings["dataset_sha256"] = made_by["dataset_sha256"]
-    check_settings(stages, settings)
-    inputs = {**settings, "points": config.points, "code": code_sha256()}
-    names = {
-        h: f"{number}_{shape_name(h)}" if number else shape_name(h)
-        for h in config.shapes
-    }
-    files = {h: folder / "groups" / f"{name}.json" for h, name in names.items()}
-
-    def outputs(hidden: Hidden) -> list[Path]:
-        members = [weights_file(folder, member) for member in config.group(hidden)]
-        return [*members, files[hidden]]
-
-    todo = [h for h in files if not stages.is_done(names[h], inputs, outputs(h))]
-    samples = functools.cache(lambda: verification_samples(split, config.base))
-    total, missing = (
-        sum(len(config.group(hidden)) for hidden in some) for some in (files, todo)
-    )
-    parts: dict[Hidden, list[Part]] = collections.defaultdict(list)
-    members: dict[Hidden, dict[str, dict]] = collections.defaultdict(dict)
-    title = f"sweep, round {number}" if number else "sweep"
-    with tqdm.tqdm(
-        total=total, initial=total - missing, desc=title, unit="member"
-    ) as bar:
-        piece = functools.partial(train_group, config=config)
-        for part in executor.stream(piece, todo):
-            hidden, made = part.hidden, members[part.hidden]
-            made |= _write_members(folder, part, samples(), config, made_by)
-            parts[hidden].append(part)
-            bar.update(len(part.members))
-            if len(made) == len(config.group(hidden)):
-                facts = _facts(parts[hidden])
-                write_json(files[hidden], {"facts": facts, "members": made})
-                of = (inputs, outputs(hidden), facts["seconds"])
-                stages.note(names[hidden], *of)
-    return {names[h]: read_json(file, "a group") for h, file in files.items()}
-
-
-def _facts(parts: Sequence[Part]) -> dict:
-    """How a group trained, in numbers."""
-    compiled = [seconds for part in parts for seconds in part.compile_s]
-    return {
-        "members": sum(len(part.members) for part in parts),
-        "seconds": round(sum(part.seconds for part in parts), 3),
-        "compiles": len(compiled),
-        "compile_seconds": round(sum(compiled), 3),
-    }
-
-
-def _write_members(
-    folder: Path,
-    part: Part,
-    samples: tuple[np.ndarray, np.ndarray],
-    config: SweepConfig,
-    made_by: Mapping[str, object],
-) -> dict[str, dict]:
-    """Write the weights files of trained members; what is known of each, by name.
-
-    Args:
-      folder: of the sweep.
-      part: the members.
-      samples: of `verification_samples`.
-      config: the sweep; a file keeps all of it but where the data lie.
-      made_by: provenance, with the hash of the data.
-    """
-    found = {}
-    normaliser = jax.tree.map(jnp.asarray, part.normaliser)
-    for number, member in enumerate(part.members):
-        loss, won = float(part.loss[number]), float(part.wins[number])
-        provenance = {
-            "git_commit": None,
-            "flags": {},
-            "versions": {},
-            **made_by,
-            "seed": member.seed,
-            "metrics": {"loss": loss, "pair_accuracy": won},
-            "mode": member.sampler.mode,
-            "config": json.loads(json.dumps(dataclasses.asdict(member))),
-            "sweep": grid_of(config),
-        }
-        params = jax.tree.map(lambda x, n=number: jnp.asarray(x[n]), part.params)
-        of = (params, normaliser, member, samples, provenance, part.seen)
-        reward = write_weights(weights_file(folder, member), *of)
-        fine = bool(part.finite[number])
-        known = {"sha256": reward.sha256, "loss": loss, "pairs_won": won}
-        found[member_name(member)] = {**known, "finite": fine}
-    return found
-
-
-def _peak_memory_gib() -> float:
-    """Of this process; that of workers is theirs."""
-    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2)
-
-
-def scores_of(
-    config: SweepConfig,
-    folder: Path,
-    split: Demonstrations,
-    executor: Executor,
-    name: str,
-    rows: Rows,
-) -> tuple[Scores, ClusterBootstrap]:
-    """Metrics of the members in a sweep's folder on the scenes of a split."""
-    runs = {
-        row: [compiled_scorer(open_reward(str(weights_file(folder, m)))) for m in of]
-        for row, of in rows.items()
-    }
-    return held_out_scores(split, name, runs, config.setup, executor)
-
-
-def validated(config: SweepConfig, groups: Mapping[str, dict], judge: Judge) -> Found:
-    """Members and configurations on the validation split.
-
-    Args:
-      config: whose members they are.
-      groups: what is known of each group's training, by its name.
-      judge: scores them.
-    """
-    members = {n: m for group in groups.values() for n, m in group["members"].items()}
-    rows: dict[str, list[TrainConfig]] = collections.defaultdict(list)
-    for one in config.members():
-        rows[row_name(one)].append(one)
-    found, vehicles = judge("validation", rows)
-    configurations = {}
-    for row, of in rows.items():
-        names = [member_name(one) for one in of]
-        values = estimates(found[row], vehicles)
-        configurations[row] = {
-            **_values_of(of[0]),
-            "members": names,
-            "finite": all(members[name]["finite"] for name in names),
-            "validation": {n: dataclasses.asdict(e) for n, e in values.items()},
-        }
-        for name, one, means in zip(
-            names, of, seed_means(found[row], vehicles), strict=True
-        ):
-            members[name] |= {**_values_of(one), "seed": one.seed, "validation": means}
-    return Found(
-        rows=rows,
-        groups={name: group["facts"] for name, group in groups.items()},
-        members=members,
-        configurations=configurations,
-    )
-
-
-def chosen(config: SweepConfig, found: Found, judge: Judge) -> dict:
-    """The best on the validation split, and its scores on the test split."""
-    metric, members = config.choose_by, found.members
-    row = best({row: found.value(row, metric) for row in found.rows}, metric)
-    names = found.configurations[row]["members"]
-    member = best({n: members[n]["validation"][metric] for n in names}, metric)
-    tested, vehicles = judge("test", {row: found.rows[row]})
-    test = estimates(tested[row], vehicles)
-    return {
-        "configuration": row,
-        "member": member,
-        "validation": found.configurations[row]["validation"],
-        "test": {name: dataclasses.asdict(one) for name, one in test.items()},
-        "member_test": seed_means(tested[row], vehicles)[names.index(member)],
-    }
-
-
-def choice(config: SweepConfig, found: Found, judge: Judge) -> dict:
-    """The part of sweep.json on the members and on the one that is chosen."""
-    metric = config.choose_by
-    return {
-        "groups": found.groups,
-        "choose_by": {"metric": metric, **dataclasses.asdict(METRICS[metric])},
-        "members": found.members,
-        "configurations": found.configurations,
-        "chosen": chosen(config, found, judge),
-    }
-
-
-def _values_of(config: TrainConfig) -> dict:
-    return {
-        "hidden": shape_name(config.reward.hidden),
-        "leaky_rate": config.leaky_rate,
-        "learning_rate": config.learning_rate,
-    }
-
-
-class Search:
-    """A study that is asked for configurations and told their values.
-
-    It has no file of its own: what it proposes follows from the seed and the values,
-    so a search that goes on asks again and finds the rounds that are finished.
-    """
-
-    def __init__(self, config: SweepConfig) -> None:
-        """Rates between the least and the largest of the grid's, on a log scale."""
-        optuna = extra_module("optuna", "optuna")
-        how = METRICS[config.choose_by]
-        direction = "maximize" if how.higher_is_better else "minimize"
-        self._study = new_study(config.base.seed, direction)
-        self._failed = optuna.trial.TrialState.FAIL
-        self._shapes = {shape_name(hidden): hidden for hidden in config.hidden_sizes}
-
-        def between(values: Sequence[float]) -> Any:  # noqa: ANN401
-            low, high = min(values), max(values)
-            return optuna.distributions.FloatDistribution(low, high, log=True)
-
-        self._space: dict[str, Any] = {
-            "hidden": optuna.distributions.CategoricalDistribution([*self._shapes]),
-            "leaky_rate": between(config.leaky_rates),
-            "learning_rate": between(config.learning_rates),
-        }
-        self._asked: list = []
-
-    def ask(self, count: int) -> list[Point]:
-        """Configurations to try next, the same one perhaps twice."""
-        self._asked = [self._study.ask(self._space) for _ in range(count)]
-        return [self._point(trial.params) for trial in self._asked]
-
-    def _point(self, params: dict) -> Point:
-        def short(name: str) -> float:
-            space, value = self._space[name], float(f"{params[name]:.{DIGITS}g}")
-            return min(max(value, space.low), space.high)
-
-        hidden = self._shapes[params["hidden"]]
-        return hidden, short("leaky_rate"), short("learning_rate")
-
-    def tell(self, values: Sequence[float]) -> None:
-        """The values of those that were asked for; NaN where one did not train."""
-        for trial, value in zip(self._asked, values, strict=True):
-            if np.isfinite(value):
-                self._study.tell(trial, value)
-            else:
-                self._study.tell(trial, state=self._failed)
-
-
-def searched(
-    config: SweepConfig, trained: Callable[[tuple[Point, ...], int], Found]
-) -> Found:
-    """All rounds of a search.
+    A search has no file of its own: its proposals follow from the seed and the values,
+    so one that goes on proposes the same points and finds them trained.
 
     Args:
       config: of the sweep.
-      trained: trains configurations that are new, and scores them on the validation
-        scenes; takes the number of the round.
+      values: of all points yielded before, which the caller fills in between two
+        rounds; NaN where one did not train.
+
+    Yields:
+      Number of the round (0: the grid), and points that are not tried yet.
     """
-    search = Search(config)
-    found = Found(rows={}, groups={}, members={}, configurations={})
+    if not config.trials:
+        yield 0, config.grid
+        return
+    optuna = extra_module("optuna", "optuna")
+    higher = METRICS[config.choose_by].higher_is_better
+    study = new_study(config.base.seed, "maximize" if higher else "minimize")
+    shapes = {shape_name(hidden): hidden for hidden in config.hidden_sizes}
+    space = {"hidden": optuna.distributions.CategoricalDistribution([*shapes])}
+    bounds = {}
+    for name in ("leaky_rate", "learning_rate"):
+        axis = config.axes[f"{name}s"]
+        low, high = bounds[name] = min(axis), max(axis)
+        space[name] = optuna.distributions.FloatDistribution(low, high, log=True)
+
+    def point_of(params: Mapping) -> Point:
+        """The rates with few digits, within their bounds."""
+        rates = {
+            name: min(max(float(f"{params[name]:.{DIGITS}g}"), low), high)
+            for name, (low, high) in bounds.items()
+        }
+        return Point(hidden=shapes[params["hidden"]], **rates)
+
     for start in range(0, config.trials, ROUND):
-        points = search.ask(min(ROUND, config.trials - start))
-        rows = {point_name(point): point for point in points}
-        if new := tuple(at for row, at in rows.items() if row not in found.rows):
-            found = found.beside(trained(new, start // ROUND + 1))
-        names = map(point_name, points)
-        search.tell([found.value(name, config.choose_by) for name in names])
-    return found
+        count = min(ROUND, config.trials - start)
+        trials = [study.ask(space) for _ in range(count)]
+        points = [point_of(trial.params) for trial in trials]
+        if new := [at for at in dict.fromkeys(points) if at not in values]:
+            yield start // ROUND + 1, new
+        for trial, point in zip(trials, points, strict=True):
+            if math.isfinite(values[point]):
+                study.tell(trial, values[point])
+            else:
+                study.tell(trial, state=optuna.trial.TrialState.FAIL)
 
 
-def grid_of(config: SweepConfig) -> dict:
-    """What decides the result, as JSON; where the data lie and how many trials do not.
+# --------------------------------------------------------------------- training
 
-    More trials go on where fewer ended.
+
+class TrainedMembers(NamedTuple):
+    """Some trained members of a group (numpy)."""
+
+    hidden: Hidden
+    members: Sequence[TrainConfig]  # [m]
+    fitted: Fitted  # leaves [m, ...]
+    normaliser: Normaliser
+    seen: np.ndarray  # [2, F] of `seen_range`
+    seconds: float  # wall time, with compiling
+    compile_s: Sequence[float]  # of each compile
+
+
+@functools.lru_cache(maxsize=1)
+def _scenes(config: SweepConfig) -> tuple[FeatureBatch, Normaliser, np.ndarray]:
+    """Candidates of the scenes to fit and their ranges, made once per process."""
+    split = open_split(config, verify=False)[1]
+    frozen = freeze(split.load("train"), split.indices("train"), config.base)
+    rows = fitting_rows(frozen, config.base)
+    seen = seen_range(rows, feature_map(config.base.features))
+    return frozen, normaliser_of(frozen, config.base), seen
+
+
+def train_group(
+    points: Sequence[Point], config: SweepConfig
+) -> Iterator[TrainedMembers]:
+    """Trains all members of points of one network shape, compiled once.
+
+    Members go in equal chunks of at most MEMBERS_AT_ONCE; the last is filled up
+    with repetitions, which are dropped.
+
+    Args:
+      points: of one shape.
+      config: the sweep.
+
+    Yields:
+      One chunk at a time, in the order of the points and their seeds.
     """
-    made = json.loads(json.dumps(dataclasses.asdict(config)))
-    kept = {n: value for n, value in made.items() if n not in ELSEWHERE}
-    return {**kept, "search": "optuna" if config.trials else "grid"}
+    frozen, normaliser, seen = _scenes(config)
+    hidden = points[0].hidden
+    members = [one for point in points for one in config.members(point)]
+    size = -(-len(members) // -(-len(members) // MEMBERS_AT_ONCE))
+    for start in range(0, len(members), size):
+        taken = members[start : start + size]
+        filled = [*taken, *[taken[-1]] * (size - len(taken))]
+        begin = time.perf_counter()
+        with compiles(PROGRAM) as compiled:
+            fitted = fit(frozen, normaliser, config.shared(hidden), members_of(filled))
+            count = len(taken)
+            fitted = jax.tree.map(lambda x, n=count: np.asarray(x)[:n], fitted)
+        yield TrainedMembers(
+            hidden=hidden,
+            members=taken,
+            fitted=fitted,
+            normaliser=jax.tree.map(np.asarray, normaliser),
+            seen=seen,
+            seconds=time.perf_counter() - begin,
+            compile_s=[*compiled],
+        )
 
 
-def settings_of(config: SweepConfig) -> dict:
-    """The same in one level, as the folder's files name it."""
-    made = grid_of(config)
-    return {n: v for n, v in made.items() if n != "base"} | made["base"]
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    """A sweep in its folder, which is held for it alone."""
+
+    config: SweepConfig
+    folder: Path
+    split: Demonstrations
+    executor: Executor
+    made_by: Mapping[str, object]  # provenance, with the hash of the data
+    settings: Mapping[str, object]
+
+    def weights_file(self, member: TrainConfig) -> Path:
+        return self.folder / "weights" / f"{member_name(member)}.msgpack"
+
+    @functools.cached_property
+    def samples(self) -> tuple[np.ndarray, np.ndarray]:
+        return verification_samples(self.split, self.config.base)
+
+    def train(self, points: Iterable[Point], number: int) -> dict[str, dict]:
+        """Trains and writes the groups of a round that are not finished.
+
+        Args:
+          points: of the round.
+          number: of the round, from 1, which its groups bear; 0: the grid.
+
+        Returns:
+          Contents of the groups' files by name: numbers of the training ("facts"), and
+          of each member ("members").
+        """
+        stages = Stages(folder=self.folder)
+        settings = {**self.settings, "dataset_sha256": self.made_by["dataset_sha256"]}
+        check_settings(stages, settings)
+        inputs = {**settings, "points": [*points], "code": code_sha256()}
+        groups: dict[Hidden, list[Point]] = {}
+        for point in points:
+            groups.setdefault(point.hidden, []).append(point)
+        prefix = f"{number}_" if number else ""
+        names = {hidden: f"{prefix}{shape_name(hidden)}" for hidden in groups}
+        files = {h: self.folder / "groups" / f"{names[h]}.json" for h in groups}
+        outputs = {
+            h: [self.weights_file(m) for at in of for m in self.config.members(at)]
+            + [files[h]]
+            for h, of in groups.items()
+        }
+        todo = [h for h in groups if not stages.is_done(names[h], inputs, outputs[h])]
+        total, missing = (sum(len(outputs[h]) - 1 for h in of) for of in (groups, todo))
+        made: dict[Hidden, dict[str, dict]] = {h: {} for h in todo}
+        seconds = dict.fromkeys(todo, 0.0)
+        compiled: dict[Hidden, list[float]] = {h: [] for h in todo}
+        title = f"sweep, round {number}" if number else "sweep"
+        with tqdm.tqdm(
+            total=total, initial=total - missing, desc=title, unit="member"
+        ) as bar:
+            piece = functools.partial(train_group, config=self.config)
+            for part in self.executor.stream(piece, [groups[h] for h in todo]):
+                h, of = part.hidden, made[part.hidden]
+                of |= self._write_weights(part)
+                seconds[h] += part.seconds
+                compiled[h] += part.compile_s
+                bar.update(len(part.members))
+                if len(of) == len(outputs[h]) - 1:
+                    facts = {
+                        "members": len(of),
+                        "seconds": round(seconds[h], 3),
+                        "compiles": len(compiled[h]),
+                        "compile_seconds": round(sum(compiled[h]), 3),
+                    }
+                    write_json(files[h], {"facts": facts, "members": of})
+                    stages.note(names[h], inputs, outputs[h], seconds[h])
+        return {names[h]: read_json(file, "a group") for h, file in files.items()}
+
+    def _write_weights(self, part: TrainedMembers) -> dict[str, dict]:
+        """Writes members' weights files; returns what is known of each, by name."""
+        found = {}
+        normaliser = jax.tree.map(jnp.asarray, part.normaliser)
+        for number, member in enumerate(part.members):
+            one = jax.tree.map(lambda x, n=number: x[n], part.fitted)
+            loss, won = float(one.loss[-1]), float(one.wins[-1])
+            provenance = {
+                "git_commit": None,
+                "flags": {},
+                "versions": {},
+                **self.made_by,
+                "seed": member.seed,
+                "metrics": {"loss": loss, "pair_accuracy": won},
+                "mode": member.sampler.mode,
+                "config": json.loads(json.dumps(dataclasses.asdict(member))),
+                "sweep": self.config.as_json(),
+            }
+            params = jax.tree.map(jnp.asarray, one.params)
+            of = (params, normaliser, member, self.samples, provenance, part.seen)
+            known = {"loss": loss, "pairs_won": won, "finite": bool(one.finite)}
+            reward = write_weights(self.weights_file(member), *of)
+            found[member_name(member)] = {"sha256": reward.sha256, **known}
+        return found
+
+    def score(
+        self, name: str, points: Sequence[Point]
+    ) -> dict[Point, tuple[dict[str, dict], list[dict[str, float]]]]:
+        """Scores trained points on the scenes of a split.
+
+        Returns:
+          For each point the estimate of each metric over seeds and scenes, and the
+          means of each seed.
+
+        Raises:
+          InputError: no scene covers the horizon, or all are of one vehicle.
+        """
+        setup = RankingSetup(
+            preset=self.config.base.features,
+            sampler=self.config.base.sampler,
+            horizon_s=self.config.horizon_s,
+        )
+        rows, index = covered_rows(self.split, name, setup.horizon_s)
+        vehicles = ClusterBootstrap(np.asarray(rows.vehicle))
+        rewards = {
+            point.name: [
+                compiled_scorer(open_reward(str(self.weights_file(member))))
+                for member in self.config.members(point)
+            ]
+            for point in points
+        }
+        scored = score_rows(rows, index, setup, numbered(rewards), self.executor)
+        outcomes = outcomes_of(scored, rows, setup)
+        found = {}
+        for point in points:
+            keys = [f"{point.name}#{seed}" for seed in range(self.config.seeds)]
+            of_seeds = [
+                scene_metrics(scored.values[key], scored.human_values[key], outcomes)
+                for key in keys
+            ]
+            estimates, means = {}, [{} for _ in keys]
+            for metric in REPORTED:
+                by = METRICS[metric].weight  # of the scenes
+                weight = None if by is None else of_seeds[0][by]
+                values = np.stack([one[metric] for one in of_seeds])
+                estimate = combine_seeds(values, vehicles, weight=weight)
+                estimates[metric] = dataclasses.asdict(estimate)
+                for mean, x in zip(means, vehicles.mean(values, weight), strict=True):
+                    mean[metric] = float(x)
+            found[point] = estimates, means
+        return found
 
 
 def check_settings(stages: Stages, settings: Mapping[str, object]) -> None:
-    """Check that the groups of a folder are of these settings.
+    """Checks that the groups of a folder are of these settings.
 
     Raises:
       InputError: one is of others (names the first).
@@ -450,13 +476,108 @@ def check_settings(stages: Stages, settings: Mapping[str, object]) -> None:
                 )
 
 
-def weights_file(folder: Path, member: TrainConfig) -> Path:
-    """A member's weights."""
-    return folder / "weights" / f"{member_name(member)}.msgpack"
+# ----------------------------------------------------------------------- choosing
+
+
+def best(values: Mapping[Name, float], metric: str) -> Name:
+    """Returns the one with the best value of a metric; the first of equals.
+
+    Raises:
+      InputError: nothing to choose from.
+    """
+    values = {name: value for name, value in values.items() if np.isfinite(value)}
+    if not values:
+        raise InputError(
+            "sweep: members: NaN or infinity in every configuration: expected one "
+            "that trains; lower learning_rates"
+        )
+    sign = -1.0 if METRICS[metric].higher_is_better else 1.0
+    return min(values, key=lambda name: sign * values[name])
+
+
+def run_sweep(
+    config: SweepConfig,
+    folder: Path,
+    executor: Executor,
+    provenance: Mapping[str, object],
+) -> dict:
+    """Trains what is not there yet, chooses, scores the chosen, writes everything.
+
+    Args:
+      config: the sweep.
+      folder: its folder; a finished group in it is not trained again.
+      executor: where groups train and scenes are scored.
+      provenance: what makes it; kept in every file.
+
+    Returns:
+      The contents of sweep.json.
+
+    Raises:
+      InputError: the folder belongs to other settings or data, or is in use; bad
+        data; no point that trains.
+    """
+    dataset, split, by = open_split(config)
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    made_by = {**provenance, "dataset_sha256": dataset.hash, "created": now}
+    settings = config.as_json()
+    settings |= settings.pop("base")
+    metric = config.choose_by
+    with only_one(folder):
+        for name in ("validation", "test"):  # what would fail only after the training
+            held_out, _ = covered_rows(split, name, config.horizon_s)
+            ClusterBootstrap(np.asarray(held_out.vehicle))
+        run = _Run(config, folder, split, executor, made_by, settings)
+        groups, members, configurations = {}, {}, {}
+        values: dict[Point, float] = {}
+        for number, points in rounds(config, values):
+            for name, group in run.train(points, number).items():
+                groups[name] = group["facts"]
+                members |= group["members"]
+            for point, (estimates, means) in run.score("validation", points).items():
+                of = point.as_json()
+                names = [member_name(one) for one in config.members(point)]
+                for seed, (name, found) in enumerate(zip(names, means, strict=True)):
+                    members[name] |= {**of, "seed": seed, "validation": found}
+                finite = all(members[name]["finite"] for name in names)
+                of |= {"members": names, "finite": finite, "validation": estimates}
+                configurations[point.name] = of
+                values[point] = estimates[metric]["value"] if finite else math.nan
+        point = best(values, metric)
+        names = configurations[point.name]["members"]
+        member = best({n: members[n]["validation"][metric] for n in names}, metric)
+        test, means = run.score("test", [point])[point]
+        body = {
+            "settings": settings,
+            "search": settings["search"],
+            "validation_by": by,
+            "scenes": {
+                name: split.indices(name).size
+                for name in ("train", "validation", "test")
+            },
+            "groups": groups,
+            "choose_by": {"metric": metric, **dataclasses.asdict(METRICS[metric])},
+            "members": members,
+            "configurations": configurations,
+            "chosen": {
+                "configuration": point.name,
+                "member": member,
+                "validation": configurations[point.name]["validation"],
+                "test": test,
+                "member_test": means[names.index(member)],
+            },
+            "made_by": made_by,
+        }
+        file = folder / "weights" / f"{member}.msgpack"
+        write_whole(folder / "best.msgpack", file.read_bytes())
+        write_json(folder / SWEEP, body)
+    return body
+
+
+# ------------------------------------------------------------------ reading again
 
 
 def read_sweep(folder: Path) -> dict:
-    """The contents of a sweep's sweep.json.
+    """Returns the contents of a sweep's sweep.json.
 
     Raises:
       InputError: missing, or not of a finished sweep.
@@ -474,7 +595,7 @@ def read_sweep(folder: Path) -> dict:
 
 
 def _check_grid(report: Mapping) -> None:
-    """Check what the picture takes for granted: as many seeds in each, a full grid.
+    """Checks what the picture takes for granted: as many seeds in each, a full grid.
 
     Only a search's configurations are no grid.
 
@@ -498,7 +619,7 @@ def _check_grid(report: Mapping) -> None:
 
 
 def table(report: Mapping) -> str:
-    """The configurations as text, best first, then the choice with its test score.
+    """Returns the configurations as text, best first, then the choice's test score.
 
     Args:
       report: of `run_sweep`.

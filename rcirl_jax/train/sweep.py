@@ -2,7 +2,7 @@
 
 All members see the same candidates, which are made once (`freeze`), and the same
 batches; they share network shape and loss and differ in seed, learning rate and leaky
-rate, which are arrays, so the whole grid is one compiled program.
+rate, which are arrays, so all of them are one compiled program.
 """
 
 import functools
@@ -43,20 +43,21 @@ class Fitted(flax.struct.PyTreeNode, kw_only=True):
 
 
 def members_of(configs: Sequence[TrainConfig]) -> Members:
-    """What is a member's own, of configurations that share everything else."""
-
-    def column(name: str, dtype: type) -> jax.Array:
-        return jnp.asarray([getattr(config, name) for config in configs], dtype)
-
-    return Members(
-        seed=column("seed", jnp.uint32),
-        learning_rate=column("learning_rate", jnp.float32),
-        leaky_rate=column("leaky_rate", jnp.float32),
-    )
+    """Returns the members of configurations that share everything else."""
+    types = {
+        "seed": jnp.uint32,
+        "learning_rate": jnp.float32,
+        "leaky_rate": jnp.float32,
+    }
+    columns = {
+        name: jnp.asarray([getattr(config, name) for config in configs], dtype)
+        for name, dtype in types.items()
+    }
+    return Members(**columns)
 
 
 def freeze(rows: Demonstration, index: np.ndarray, config: TrainConfig) -> FeatureBatch:
-    """Candidates and features of S scenes, made once.
+    """Makes candidates and features of S scenes, once for all epochs.
 
     Args:
       rows: S demonstrations (numpy).
@@ -78,22 +79,10 @@ def freeze(rows: Demonstration, index: np.ndarray, config: TrainConfig) -> Featu
     return jax.tree.map(jnp.asarray, frozen)
 
 
-def first_state(
-    config: TrainConfig,
-    normaliser: Normaliser,
-    seed: jax.Array,
-    learning_rate: jax.Array,
-) -> TrainState:
-    """A member's state before its first step; its seed and rate may be traced."""
-    state = init_state(config, normaliser, seed)
-    rates = optax.tree.set(state.opt_state, learning_rate=learning_rate)
-    return state.replace(opt_state=rates)
-
-
 def fit(
     frozen: FeatureBatch, normaliser: Normaliser, config: TrainConfig, members: Members
 ) -> Fitted:
-    """Train all members on a frozen set.
+    """Trains all members on a frozen set.
 
     The same steps as a training run's, except that candidates do not change from
     epoch to epoch. The batch order comes from `config.seed` and is shared.
@@ -126,6 +115,11 @@ def _fit(
     batches = -(-count // size)
     train_step = make_train_step(config)
 
+    def first(member: Members) -> TrainState:
+        state = init_state(config, normaliser, member.seed)
+        rates = optax.tree.set(state.opt_state, learning_rate=member.learning_rate)
+        return state.replace(opt_state=rates)
+
     def step(states: TrainState, at: tuple) -> tuple:
         rows, weight = at
         batch = jax.tree.map(lambda x: x[rows], frozen)
@@ -143,9 +137,9 @@ def _fit(
         wins = sums.wins / jnp.maximum(sums.pairs, 1.0)
         return states, (loss, wins, jnp.all(seen.finite, axis=0))
 
-    first = functools.partial(first_state, config, normaliser)
-    states = jax.vmap(first)(members.seed, members.learning_rate)
-    states, (loss, wins, fine) = jax.lax.scan(epoch, states, jnp.arange(config.epochs))
+    states, (loss, wins, fine) = jax.lax.scan(
+        epoch, jax.vmap(first)(members), jnp.arange(config.epochs)
+    )
     return Fitted(
         params=cast(RewardParams, states.params),
         loss=loss.T,

@@ -16,7 +16,7 @@ from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite
 from rcirl_jax.evaluation.ranking import score
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.learners import learner_configs, train_learners
-from rcirl_jax.evaluation.ranking.sweep import train_group
+from rcirl_jax.export.sweep import train_group
 from rcirl_jax.planner.rank import RankConfig, best_plan
 from rcirl_jax.sampling import sample
 from rcirl_jax.simulation.metrics import CaseMetrics
@@ -70,7 +70,7 @@ def test_a_stored_scene_is_named_before_training_sweep_and_ranking(tmp_path, val
     for work, place in (
         (lambda: train(data, tmp_path / "run", CONFIG), f"train: {line(TRAINED)}"),
         (lambda: train_learners(data, learners, [0]), f"train: {line(TRAINED)}"),
-        (lambda: next(train_group((6,), sweep)), f"{split}: {line(TRAINED)}"),
+        (lambda: next(train_group(sweep.grid[:1], sweep)), f"{split}: {line(TRAINED)}"),
         (lambda: evaluate_ranking(held, {}, SETUP), f"split test: {line(HELD_OUT)}"),
     ):
         with pytest.raises(InputError, match=f"^{place}{LIMIT}$"):
