@@ -1,8 +1,5 @@
 """Intervals and tests against scipy, closed forms and plain loops."""
 
-import fractions
-import math
-
 import numpy as np
 import pytest
 from hypothesis import example, given
@@ -17,9 +14,7 @@ from rcirl_jax.evaluation.statistics import (
     cluster_t,
     combine_seeds,
     holm,
-    mcnemar_exact,
     paired_difference,
-    rule_of_three,
 )
 
 
@@ -154,14 +149,12 @@ def test_no_difference_has_p_one_and_null_p_values_are_uniform():
     assert np.mean(np.array(p) < 0.5) == pytest.approx(0.5, abs=0.1)
 
 
-@pytest.mark.parametrize("others", [5, 7])
-def test_paired_difference_counts_the_runs_of_both_sides(others):
+def test_paired_difference_counts_the_runs_of_both_sides():
     rng = np.random.default_rng(9)
-    a, b = rng.normal(size=(5, 1)), rng.normal(size=(others, 1))
-    bootstrap = ClusterBootstrap(np.arange(20), 8000)
-    wide = np.ones((1, 20))
+    a, b = rng.normal(size=(5, 1)), rng.normal(size=(7, 1))
+    bootstrap, wide = ClusterBootstrap(np.arange(20), 8000), np.ones((1, 20))
     found = paired_difference(a * wide, b * wide, bootstrap)
-    want = np.hypot(a.std(ddof=1) / np.sqrt(5), b.std(ddof=1) / np.sqrt(others))
+    want = np.hypot(a.std(ddof=1) / np.sqrt(5), b.std(ddof=1) / np.sqrt(7))
     assert found.mean == pytest.approx(a.mean() - b.mean())
     assert found.se == pytest.approx(want, rel=0.04)
 
@@ -179,41 +172,11 @@ def test_median_interval_holds_the_median():
     assert y[high - 4] <= got.high <= y[high + 3]
 
 
-def test_same_seed_same_interval():
-    x, clusters = clustered(np.random.default_rng(12))
-    assert combine_seeds(x, clusters) == combine_seeds(x, clusters)
-    other = combine_seeds(x, ClusterBootstrap(clusters, seed=1))
-    assert other.low != combine_seeds(x, clusters).low
-
-
-@given(
-    n=st.integers(1, 20_000),
-    share=st.floats(0.0, 1.0),
-    confidence=st.sampled_from([0.8, 0.9, 0.95, 0.999]),
-)
-def test_clopper_pearson_are_quantiles_of_beta_distributions(n, share, confidence):
-    k = round(share * n)
-    tail = 0.5 * (1.0 - confidence)
-    low = stats.beta.ppf(tail, k, n - k + 1) if k else 0.0
-    high = stats.beta.isf(tail, k + 1, n - k) if k < n else 1.0
-    assert clopper_pearson(k, n, confidence) == pytest.approx((low, high), abs=1e-9)
-
-
 @pytest.mark.parametrize("n", [1, 2, 20, 3420])
 def test_nothing_seen_in_n_trials(n):
     exact = 1.0 - 0.05 ** (1.0 / n)
     assert clopper_pearson(0, n, 0.90)[1] == pytest.approx(exact, rel=1e-10)
     assert clopper_pearson(n, n, 0.90)[0] == pytest.approx(1.0 - exact, rel=1e-10)
-    assert exact <= rule_of_three(n) <= 1.0
-    assert rule_of_three(n) == min(1.0, 3.0 / n)
-
-
-@given(b=st.integers(0, 400), c=st.integers(0, 400))
-def test_mcnemar_is_twice_the_smaller_tail_of_coins(b, c):
-    tail = sum(math.comb(b + c, i) for i in range(min(b, c) + 1))
-    want = min(1.0, 2.0 * float(fractions.Fraction(tail, 2 ** (b + c))))
-    assert mcnemar_exact(b, c) == pytest.approx(want, rel=1e-9, abs=1e-300)
-    assert mcnemar_exact(b, c) == mcnemar_exact(c, b)
 
 
 @example([0.02, 0.022, 0.9])  # the second, alone, would be rejected at 0.05
@@ -259,15 +222,9 @@ BOOTSTRAP = ClusterBootstrap(np.arange(5))
     ("work", "says"),
     [
         (lambda: ClusterBootstrap(np.zeros(5, int)), "at least 2"),
-        (lambda: BOOTSTRAP.means(np.ones(4)), "expected"),
         (lambda: BOOTSTRAP.means(np.full(5, np.nan)), "all finite"),
         (lambda: BOOTSTRAP.means(np.ones(5), np.arange(5.0)), "weight"),
-        (lambda: clopper_pearson(-1, 3), "clopper_pearson"),
-        (lambda: clopper_pearson(4, 3), "clopper_pearson"),
-        (lambda: clopper_pearson(0, 0), "clopper_pearson"),
         (lambda: holm(np.array([0.2, np.nan])), "holm"),
-        (lambda: mcnemar_exact(-1, 2), "mcnemar"),
-        (lambda: rule_of_three(0), "rule_of_three"),
     ],
 )
 def test_bad_input_is_refused(work, says):

@@ -26,7 +26,6 @@ from rcirl_jax.evaluation.statistics import (
     family_clusters,
     holm,
     mcnemar_exact,
-    rule_of_three,
 )
 from rcirl_jax.runtime.atomic_files import write_whole
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
@@ -108,9 +107,13 @@ class SuiteReport:
 
 
 def rate(k: int, n: int) -> Rate:
-    """K successes of n, exact (Clopper and Pearson 1934)."""
+    """K successes of n, exact (Clopper and Pearson 1934).
+
+    Where nothing failed the bound is that of the rule of three: the exact one-sided
+    bound of the failures is 1 - 0.05^(1/n) < -ln(0.05) / n < 3 / n.
+    """
     low, high = clopper_pearson(k, n)
-    bound = 1.0 - rule_of_three(n) if k == n else None
+    bound = 1.0 - min(1.0, 3.0 / n) if k == n else None
     return Rate(k=k, n=n, rate=k / n, low=low, high=high, bound=bound)
 
 

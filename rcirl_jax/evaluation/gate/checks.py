@@ -50,7 +50,6 @@ from rcirl_jax.evaluation.statistics import (
     no_more_faults,
     over_clusters,
     paired_rates,
-    tango,
     within_strata,
 )
 from rcirl_jax.simulation.families import family_title
@@ -281,7 +280,7 @@ def no_loss(pair: Pair, config: GateConfig) -> list[Check]:
     for name in RATES:
         pairs, note = _discordant(mine[name], theirs[name]), ""
         margin = config.margins[name]
-        if tango(0, 0, count)[0] <= -margin:
+        if paired_rates((0, 0), count).low <= -margin:
             note = f"{count} cases can never prove a loss below {100 * margin:g} %"
         add(name, paired_rates(pairs, count), pairs, note=note)
     _, strata = np.unique(pair.families, return_inverse=True)

@@ -95,8 +95,6 @@ def test_how_many_cases_without_any_fault_it_takes():
     assert (least, most) == (1474, 1533)
     assert no_more_faults(0, 0, least - 1, 0.0025) > ALPHA
     assert no_more_faults(0, 0, most, 0.0025) <= ALPHA
-    with pytest.raises(InputError, match="no_more_faults: gained, lost, n, margin"):
-        no_more_faults(3, 3, 5, 0.1)
 
 
 # -------------------------------------------------------------------------- safety
