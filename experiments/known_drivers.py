@@ -10,8 +10,7 @@ import numpy as np
 from rcirl_jax.evaluation.closed_loop.runs import SuiteRuns
 from rcirl_jax.evaluation.closed_loop.summary import text_table
 from rcirl_jax.evaluation.gate import types as gate
-from rcirl_jax.evaluation.gate.checks import MIN_CLUSTERS
-from rcirl_jax.evaluation.gate.verdict import judge, pair_of
+from rcirl_jax.evaluation.gate.verdict import MIN_CLUSTERS, judge, pair_of
 from rcirl_jax.evaluation.statistics import clopper_pearson
 from rcirl_jax.planner import rank
 from rcirl_jax.planner.baselines import Idm

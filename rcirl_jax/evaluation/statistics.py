@@ -21,7 +21,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy  # loads scipy.stats, half a second, where it is first used
-from scipy.optimize import brentq
+from numpy.typing import ArrayLike
+from scipy.optimize import root_scalar
 from scipy.special import bdtr, bdtrc, ndtr, ndtri, stdtr, stdtrit
 
 from rcirl_jax.errors import InputError
@@ -409,7 +410,7 @@ def mcnemar_exact(b: int, c: int) -> float:
     return float(scipy.stats.binomtest(b, b + c).pvalue) if b + c else 1.0
 
 
-def holm(p_values: np.ndarray) -> np.ndarray:
+def holm(p_values: ArrayLike) -> np.ndarray:
     """Returns Holm's step-down adjusted p values, in the order given.
 
     With p sorted upwards, adjusted_i = max over j <= i of min(1, (m - j) p_j), j from
@@ -466,7 +467,9 @@ def paired_rates(pairs: tuple[int, int], total: int) -> Difference:
 
         # the score is 0 at the mean; a mean of -1 or 1 is its own end
         known = mean == outer or beyond(outer) <= 0.0
-        return outer if known else brentq(beyond, mean, outer, xtol=1e-13)
+        if known:
+            return outer
+        return float(root_scalar(beyond, bracket=(mean, outer), xtol=1e-13).root)
 
     low, high, p = end(-1.0), end(1.0), mcnemar_exact(*pairs)
     return Difference(mean=mean, low=low, high=high, se=np.nan, p=p)

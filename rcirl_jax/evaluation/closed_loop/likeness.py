@@ -201,6 +201,8 @@ def read_arrays(path: Path) -> Likeness:
         count = arrays["clusters"].size
         check_array(arrays, "clusters", "iu", (count,))
         check_array(arrays, "distance", "f", (len(names), count))
+        if not np.all((arrays["distance"] >= 0.0) & (arrays["distance"] < np.inf)):
+            raise ValueError("distance: below 0, NaN or infinity")
         distance = dict(zip(names, arrays["distance"], strict=True))
         return Likeness(distance=distance, clusters=arrays["clusters"])
 

@@ -70,13 +70,9 @@ class GateConfig:
             if not 0.0 < margin < 1.0:
                 raise InputError(f"{name}: {margin}: expected within (0, 1)")
         known = (*COLUMNS, "progress", "nuplan")
-        for name in self.primary:
-            if name not in known:
-                raise InputError(
-                    f"primary: {name}: expected some of {', '.join(known)}"
-                )
-        if not self.primary:
-            raise InputError("primary: none: expected at least one metric")
+        if not self.primary or not set(self.primary) <= set(known):
+            bad = next((n for n in self.primary if n not in known), "none")
+            raise InputError(f"primary: {bad}: expected some of {', '.join(known)}")
         for flag in ("primary", "trivial_baselines", "accept"):
             names = getattr(self, flag)
             if len(set(names)) != len(names):
@@ -91,22 +87,6 @@ class Likeness:
     # row name -> [D] >= 0, distance to the human; lower is nearer
     distance: Mapping[str, np.ndarray]
     clusters: np.ndarray  # [D] int, the ego's vehicle in each drive
-
-    def __post_init__(self) -> None:
-        """As many finite distances >= 0 for every row as there are clusters."""
-        count = len(self.clusters)
-        for name, values in self.distance.items():
-            values = np.asarray(values, np.float64)
-            if values.shape != (count,):
-                raise InputError(
-                    f"likeness: {name}: shape {values.shape}: expected ({count},)"
-                )
-            bad = ~(np.isfinite(values) & (values >= 0.0))
-            if bad.any():
-                raise InputError(
-                    f"likeness: {name}: drive {int(np.argmax(bad))}:"
-                    f" {values[bad][0]}: expected a distance >= 0"
-                )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -125,29 +105,6 @@ class Pair:
     )
     # rows `CANDIDATE`, `name` and the trivial baselines
     likeness: Likeness | None = None
-
-    def __post_init__(self) -> None:
-        """Same cases, all finite where a drive has a number."""
-        count = len(self.ids)
-        rows = {CANDIDATE: self.candidate, self.name: self.incumbent}
-        for name, metrics in {**rows, **self.trivial_baselines}.items():
-            for field in ("progress", "at_fault", "holds", "max_j", "rms_a"):
-                values = np.asarray(getattr(metrics, field), np.float64)
-                if len(values) != count:
-                    raise InputError(
-                        f"gate: {name}: {len(values)} cases: expected {count}"
-                    )
-                if not np.isfinite(values).all():
-                    bad = self.ids[int(np.argwhere(~np.isfinite(values))[0, 0])]
-                    raise InputError(
-                        f"gate: {name}: {bad}: {field}: not a finite number"
-                    )
-        if len(set(self.ids)) != count:
-            twice = next(name for name in self.ids if self.ids.count(name) > 1)
-            raise InputError(f"gate: {twice}: met twice: expected distinct cases")
-        for name in ("families", "reference", "preventable"):
-            if len(getattr(self, name)) != count:
-                raise InputError(f"gate: {name}: expected {count} values")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

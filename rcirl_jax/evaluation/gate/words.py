@@ -2,6 +2,7 @@
 
 import textwrap
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,54 +15,85 @@ MAX_LINES = 3  # of the sentence, in these columns
 # how many details it names, and whether drives that crawl are among them
 DETAILS = ((3, True), (2, True), (2, False), (1, True), (1, False))
 HALF = 0.5  # of the incumbent's progress: a drive that hardly moves on
+KEEP = "keep the incumbent"
+WORST_FAMILIES = 10  # rows of the terminal table; the JSON has all
 
-FAULTS = {  # safety checks -> (one, several), as of cases
-    "collision": (
-        "preventable at-fault collision",
-        "preventable at-fault collisions",
+
+class Words(NamedTuple):
+    """What a check over all cases is called; the templates take `_numbers`."""
+
+    title: str
+    worse: str  # as what the candidate does
+    better: str = ""
+    one: str = ""  # a single fault
+
+
+def _fault(one: str, several: str) -> Words:
+    return Words(several, "has {lost} new {fault} ({gained} gone)", one=one)
+
+
+def _holds(what: str) -> Words:
+    worse, better = f"keeps {what} in {{net}} fewer", f"{what} in {{net}} more"
+    return Words(f"drives that keep {what}", f"{worse} drives", f"{better} drives")
+
+
+WORDS = {
+    "collision": _fault(
+        "preventable at-fault collision", "preventable at-fault collisions"
     ),
-    "vulnerable": (
+    "vulnerable": _fault(
         "at-fault collision with a pedestrian or cyclist",
         "at-fault collisions with pedestrians or cyclists",
     ),
-    "red_light": ("red light run", "red lights run"),
-    "stop_sign": ("stop sign run", "stop signs run"),
+    "red_light": _fault("red light run", "red lights run"),
+    "stop_sign": _fault("stop sign run", "stop signs run"),
+    "collision_free": _holds("free of at-fault collisions"),
+    "speed_limit": _holds("within the speed limit"),
+    "a_station": _holds("|acceleration| below 4 m/s²"),
+    "a_lateral": _holds("|lateral acceleration| below 4 m/s²"),
+    "j_station": _holds("|jerk| below 6 m/s³"),
+    "j_lateral": _holds("|lateral jerk| below 6 m/s³"),
+    "min_ttc": _holds("more than 0.95 s to a collision"),
+    "on_road": _holds("on the road"),
+    "progress": Words("progress", "makes {less} % less progress", "progress {more} %"),
+    "nuplan": Words(
+        "nuPlan's score",
+        "has {less} points less of nuPlan's score",
+        "nuPlan's score {more} points",
+    ),
+    "likeness": Words(
+        "nearness to the human",
+        "is {less} % farther from the human",
+        "{more} % nearer to the human",
+    ),
 }
-HOLDS = {  # what a drive holds, as "keeps ... in n drives"
-    "collision_free": "free of at-fault collisions",
-    "speed_limit": "within the speed limit",
-    "a_station": "|acceleration| below 4 m/s²",
-    "a_lateral": "|lateral acceleration| below 4 m/s²",
-    "j_station": "|jerk| below 6 m/s³",
-    "j_lateral": "|lateral jerk| below 6 m/s³",
-    "min_ttc": "more than 0.95 s to a collision",
-    "on_road": "on the road",
+HEADS = {
+    "do not ship": "Do not ship: on {cases}, against {name}, the candidate {losses}",
+    "ship": "Ship: on {cases} the candidate loses nothing against {name}",
+    "no difference": (
+        "No difference: on {cases} the candidate is neither worse nor better than"
+        " {name}"
+    ),
+    "could not judge": (
+        "Could not judge: on {cases} nothing is worse for certain than with {name}"
+    ),
 }
-# what to do where human-likeness was not measured
-TO_MEASURE = "measure human-likeness on held-out recordings (docs/gate.md)"
-AMOUNTS = {
-    "progress": "progress",
-    "nuplan": "nuPlan's score",
-    "likeness": "nearness to the human",
-}
-
-
-def title_of(name: str) -> str:
-    """What a check of all cases is about, in words."""
-    if name in FAULTS:
-        return FAULTS[name][1]
-    if name in HOLDS:
-        return f"drives that keep {HOLDS[name]}"
-    return AMOUNTS[name]
+# kinds in the order of the sentence's losses: faults first, trivial baselines last
+ORDER = ("safety", "families", "no loss", "gain", "likeness", "trivial baselines")
 
 
 def family_of(check: Check) -> str:
-    """The family that a check is about; "" if it is about all cases."""
+    """Returns the family that a check is about; "" if it is about all cases."""
     return check.name.rpartition(", ")[0] if check.kind == "families" else ""
 
 
+def name_of(pair: Pair) -> str:
+    """Returns the incumbent's name in a sentence."""
+    return "the incumbent" if pair.name == INCUMBENT else pair.name
+
+
 def sentence(pair: Pair, verdict: Verdict) -> str:
-    """What was compared, what got better, what worse and where, what to do next.
+    """Says what was compared, what got better, what worse and where, what to do next.
 
     At most `MAX_LINES` lines of `WIDTH` columns: as many details as fit.
 
@@ -70,168 +102,107 @@ def sentence(pair: Pair, verdict: Verdict) -> str:
       verdict: all but its sentence.
     """
     checks = verdict.checks
-    worse = sorted((c for c in checks if c.outcome == "fail"), key=_rank)
+    worse = [c for c in checks if c.outcome == "fail"]
+    worse.sort(key=lambda c: (ORDER.index(c.kind), c.difference))
     better = [c for c in checks if c.kind == "gain" and c.outcome == "pass"]
     better.sort(key=lambda c: c.name != "likeness")  # what it is for comes first
+    gains = [WORDS[c.name].better.format(**_numbers(c)) for c in better]
     unclear = [c for c in checks if c.kind != "gain" and c.outcome == "open"]
-    gains = [_better(c) for c in better]
-    titles = [c.title for c in unclear]
-    after = _next(verdict, worse, unclear)
     said = ""
     for details, crawling in DETAILS:
         losses = _listed([_worse(c, pair, crawling) for c in worse], details)
-        parts = [_head(verdict, name_of(pair), losses)]
+        head = HEADS[verdict.decision]
+        cases = f"{verdict.cases:,} cases"
+        parts = [head.format(cases=cases, name=name_of(pair), losses=losses)]
         if gains:
             words = "But better" if worse else "Better"
             parts.append(f"{words}: {_listed(gains, details)}")
-        if titles and not worse:
-            parts.append(f"Undecided: {_listed(titles, details)}")
-        said = ". ".join([*parts, after]) + "."
+        if unclear and not worse:
+            parts.append(f"Undecided: {_listed([c.title for c in unclear], details)}")
+        said = ". ".join([*parts, f"Next: {_next(verdict, worse, unclear)}"]) + "."
         if len(textwrap.wrap(said, WIDTH)) <= MAX_LINES:
             return said
     return textwrap.shorten(said, (MAX_LINES - 1) * WIDTH, placeholder=" ...")
 
 
 def reason(check: Check) -> str:
-    """A check with its numbers, as a reason of the decision."""
+    """Returns a check with its numbers, as a reason of the decision."""
+    head, note = f"{check.kind}: {check.title}: ", check.note
     if not check.measured:
-        return f"{check.kind}: {check.title}: {check.note}"
+        return head + note
+    mean, low, high = _percents(check)
     pairs = ""
     if check.lost is not None:
         pairs = f", better in {check.gained} cases, worse in {check.lost}"
-    return (
-        f"{check.kind}: {check.title}: {100 * check.difference:+.2f} "
-        f"[{100 * check.low:+.2f}, {100 * check.high:+.2f}] %{pairs}"
-        + (f"; {check.note}" if check.note else "")
-    )
+    return f"{head}{mean} [{low}, {high}] %{pairs}" + (f"; {note}" if note else "")
 
 
-def name_of(pair: Pair) -> str:
-    """The incumbent's name in a sentence."""
-    return "the incumbent" if pair.name == INCUMBENT else pair.name
-
-
-def _head(verdict: Verdict, name: str, losses: str) -> str:
-    """The decision, what was compared, and the losses."""
-    cases = f"{verdict.cases:,} cases"
-    if verdict.decision == "do not ship":
-        return f"Do not ship: on {cases}, against {name}, the candidate {losses}"
-    if verdict.decision == "ship":
-        return f"Ship: on {cases} the candidate loses nothing against {name}"
-    if verdict.decision == "no difference":
-        return (
-            f"No difference: on {cases} the candidate is neither worse nor better"
-            f" than {name}"
-        )
-    return f"Could not judge: on {cases} nothing is worse for certain than with {name}"
-
-
-def _rank(check: Check) -> tuple[int, float]:
-    """Faults first, then where most is lost; trivial baselines last."""
-    order = ("safety", "families", "no loss", "gain", "likeness", "trivial baselines")
-    return order.index(check.kind), check.difference
+def _percents(check: Check) -> list[str]:
+    """Returns the difference and the ends of its interval in percent."""
+    return [f"{100.0 * x:+.2f}" for x in (check.difference, check.low, check.high)]
 
 
 def _listed(said: Sequence[str], count: int) -> str:
-    """The first of them, and how many more."""
+    """Joins the first of them, and says how many more there are."""
     more = len(said) - count
     return "; ".join(said[:count]) + (f"; and {more} more" if more > 0 else "")
 
 
+def _numbers(check: Check) -> dict[str, object]:
+    """Returns what the templates of `WORDS` take."""
+    words, percent = WORDS[check.name], 100.0 * check.difference
+    return {
+        "lost": check.lost,
+        "gained": check.gained,
+        "net": f"{abs((check.gained or 0) - (check.lost or 0)):,}",
+        "fault": words.one if check.lost == 1 else words.title,
+        "less": f"{-percent:.1f}",
+        "more": f"{percent:+.1f}",
+    }
+
+
 def _worse(check: Check, pair: Pair, crawling: bool) -> str:
-    """A failed check as what the candidate does."""
-    family = family_of(check)
+    """Returns a failed check as what the candidate does."""
     if check.kind == "trivial baselines":
         return f"is not {check.title}"
-    if check.kind == "safety":
-        return (
-            f"has {check.lost} new {FAULTS[check.name][check.lost != 1]}"
-            f" ({check.gained} gone)"
-        )
-    if family and check.lost is not None:
+    family = family_of(check)
+    if not family:
+        return WORDS[check.name].worse.format(**_numbers(check))
+    title, at = family_title(family), np.asarray(pair.families) == family
+    where = f'in "{title[:1].lower()}{title[1:]}"'
+    if check.lost is not None:
         net = check.lost - (check.gained or 0)
-        cases = int(np.sum(np.asarray(pair.families) == family))
-        return f"has {net} fewer clean drives of {cases} in {_quoted(family)}"
-    if family:
-        crawls = _crawls(pair, family) if crawling else ""
-        return f"{_less('progress', check)} in {_quoted(family)}{crawls}"
-    if check.name in AMOUNTS:
-        return _less(check.name, check)
-    return f"keeps {HOLDS[check.name]} in {_net(check)} fewer drives"
-
-
-def _quoted(family: str) -> str:
-    """A family's title in a sentence."""
-    title = family_title(family)
-    return f'"{title[:1].lower()}{title[1:]}"'
-
-
-def _less(name: str, check: Check) -> str:
-    percent = f"{-100.0 * check.difference:.1f}"
-    if name == "likeness":
-        return f"is {percent} % farther from the human"
-    if name == "nuplan":
-        return f"has {percent} points less of nuPlan's score"
-    return f"makes {percent} % less progress"
-
-
-def _crawls(pair: Pair, family: str) -> str:
-    """How many drives of a family hardly move on, if any."""
-    at = np.asarray(pair.families) == family
-    mine = np.asarray(pair.candidate.progress, np.float64)[at]
-    theirs = np.asarray(pair.incumbent.progress, np.float64)[at]
-    slow = int(np.sum(mine < HALF * theirs))
-    return f" (less than half as far in {slow} of {at.sum()} drives)" if slow else ""
-
-
-def _net(check: Check) -> str:
-    return f"{abs((check.gained or 0) - (check.lost or 0)):,}"
-
-
-def _better(check: Check) -> str:
-    percent = f"{100.0 * check.difference:+.1f}"
-    if check.name == "likeness":
-        return f"{percent} % nearer to the human"
-    if check.name == "nuplan":
-        return f"nuPlan's score {percent} points"
-    if check.name == "progress":
-        return f"progress {percent} %"
-    return f"{HOLDS[check.name]} in {_net(check)} more drives"
+        return f"has {net} fewer clean drives of {at.sum()} {where}"
+    mine, theirs = (
+        np.asarray(x.progress, np.float64)[at] for x in (pair.candidate, pair.incumbent)
+    )
+    slow = int(np.sum(mine < HALF * theirs)) if crawling else 0
+    crawls = f" (less than half as far in {slow} of {at.sum()} drives)" if slow else ""
+    return f"makes {-100.0 * check.difference:.1f} % less progress {where}{crawls}"
 
 
 def _next(verdict: Verdict, worse: Sequence[Check], unclear: Sequence[Check]) -> str:
-    """What to do now."""
-    if worse and verdict.look_at:
-        return f"Next: replay {verdict.look_at[0]}"
+    """Returns what to do now."""
     if worse:
-        return "Next: keep the incumbent"
-    missing = next((c.note for c in unclear if not c.measured and c.note), "")
-    if missing:
-        return f"Next: {missing}"
+        return f"replay {verdict.look_at[0]}" if verdict.look_at else KEEP
+    if missing := next((c.note for c in unclear if not c.measured and c.note), ""):
+        return missing
     if verdict.decision == "ship":
-        return "Next: look at the cases named below, then your own tests"
+        return "look at the cases named below, then your own tests"
     if verdict.part:
-        return "Next: drive the full suite"
-    if any(c.kind in ("safety", "trivial baselines") for c in unclear) and new(verdict):
-        return "Next: look at the new faults; --accept those that may stay"
-    if unclear:
-        return "Next: keep the incumbent, or drive more cases"
-    return "Next: keep the incumbent"
-
-
-def new(verdict: Verdict) -> list[NewFault]:
-    """New faults that nobody has accepted."""
-    return [fault for fault in verdict.new_faults if not fault.accepted]
+        return "drive the full suite"
+    unsafe = any(c.kind in ("safety", "trivial baselines") for c in unclear)
+    if unsafe and not all(fault.accepted for fault in verdict.new_faults):
+        return "look at the new faults; --accept those that may stay"
+    return f"{KEEP}, or drive more cases" if unclear else KEEP
 
 
 def fault_words(fault: NewFault) -> str:
-    """One new fault as a line."""
-    said = []
-    for name in fault.faults:
-        words = FAULTS[name][0]
-        if name == "collision" and not fault.preventable:
-            words = "at-fault collision, not preventable"
-        said.append(words)
+    """Returns one new fault as a line."""
+    said = [WORDS[name].one for name in fault.faults]
+    if not fault.preventable and "collision" in fault.faults:
+        at = fault.faults.index("collision")
+        said[at] = "at-fault collision, not preventable"
     accepted = " (accepted)" if fault.accepted else ""
     return f"{fault.case}: {', '.join(said)}{accepted}"
 
@@ -249,11 +220,10 @@ TITLES = {
     "likeness": "Not farther from the human",
     "gain": "Better somewhere, worse nowhere (Holm over the primary metrics)",
 }
-WORST_FAMILIES = 10  # rows of the terminal table; the JSON has all
 
 
 def format_verdict(verdict: Verdict) -> str:
-    """The sentence and decision first, then every kind of check as a table."""
+    """Returns the sentence and decision, then every kind of check as a table."""
     lines = textwrap.wrap(verdict.sentence, WIDTH)
     lines += ["", f"verdict: {verdict.decision.upper()}"]
     lines += [line for said in verdict.reasons for line in _item(said)]
@@ -279,13 +249,11 @@ def format_verdict(verdict: Verdict) -> str:
 
 
 def _cells(check: Check) -> list[str]:
-    """A line of the table."""
+    """Returns a line of the table."""
     outcome = (OF_GAINS if check.kind == "gain" else OUTCOMES)[check.outcome]
     if not check.measured:
         return [check.title, outcome, "", "not measured", "", "", ""]
-    mean, low, high = (
-        f"{100.0 * x:+.2f}" for x in (check.difference, check.low, check.high)
-    )
+    mean, low, high = _percents(check)
     return [
         check.title,
         outcome,

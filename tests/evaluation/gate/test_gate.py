@@ -4,6 +4,7 @@ import dataclasses
 import json
 import textwrap
 
+import jax
 import numpy as np
 import pytest
 
@@ -131,10 +132,6 @@ def test_nothing_ships_on_a_part_of_the_suite():
     verdict = judge(both, GateConfig(), "cases of 2 s instead of 120 s")
     assert verdict.decision == "could not judge"
     assert verdict.reasons[0].startswith("cases of 2 s instead of 120 s")
-    # whatever the decision, what was left out is said
-    none = judge(pair(drives(), drives()), GateConfig(), "cases of 2 s")
-    assert (none.decision, none.part) == ("no difference", "cases of 2 s")
-    assert "a part of the suite: cases of 2 s" in format_verdict(none)
 
 
 @pytest.mark.parametrize("families", [2, 20])
@@ -154,9 +151,7 @@ def test_exchangeable_rewards_hardly_ever_ship(families):
 
 
 def test_a_slower_reward_is_refused():
-    verdict = decide(further(drives(), 0.97), drives())
-    assert verdict.decision == "do not ship"
-    assert failed(verdict) == {"progress"}
+    assert failed(decide(further(drives(), 0.97), drives())) == {"progress"}
 
 
 def test_progress_is_compared_within_the_families():
@@ -229,28 +224,14 @@ def test_a_gain_does_not_pay_for_comfort():
     assert "But better: progress +10.0 %" in verdict.sentence
 
 
-def part_of(whole, keep):
+def part_of(whole, at):
     """The same pair on some of its cases."""
-
-    def cut(one):
-        if isinstance(one, CaseMetrics):
-            fields = dataclasses.fields(CaseMetrics)
-            values = {f.name: np.asarray(getattr(one, f.name))[keep] for f in fields}
-            return CaseMetrics(**values)
-        return (
-            {k: cut(v) for k, v in one.items()} if isinstance(one, dict) else one[keep]
-        )
-
-    names = (
-        "candidate",
-        "incumbent",
-        "trivial_baselines",
-        "families",
-        "ids",
-        "reference",
-    )
-    parts = {name: cut(getattr(whole, name)) for name in (*names, "preventable")}
-    return dataclasses.replace(whole, **parts)
+    names = ("families", "ids", "reference", "preventable")
+    parts = {name: getattr(whole, name)[at] for name in names}
+    rows = {"candidate": whole.candidate, "incumbent": whole.incumbent}
+    parts |= jax.tree.map(lambda x: np.asarray(x)[at], rows)
+    trivial = jax.tree.map(lambda x: np.asarray(x)[at], whole.trivial_baselines)
+    return dataclasses.replace(whole, trivial_baselines=trivial, **parts)
 
 
 def test_too_few_cases_cannot_be_judged():
@@ -258,9 +239,6 @@ def test_too_few_cases_cannot_be_judged():
     verdict = judge(few, GateConfig())
     assert (verdict.decision, verdict.exit_code) == ("could not judge", 2)
     assert "600 cases can never prove" in verdict.reasons[0]
-    names = [f"family{i // 8}" for i in range(600)]
-    scattered = judge(dataclasses.replace(few, families=names), GateConfig())
-    assert any("8 cases: expected at least 10" in r for r in scattered.reasons)
     margins = dict.fromkeys(
         ("collision", "vulnerable", "red_light", "stop_sign", "collision_free",
          "min_ttc", "speed_limit", "on_road"), 0.02,
@@ -286,20 +264,18 @@ def test_few_families_are_said_in_words_and_intervals_stay_where_shares_can_be()
 # --------------------------------------------------------------------- its words
 
 
-def test_bad_input_is_one_line():
-    good = drives()
-    both = pair(good, good)
-    twice = [*both.ids[:-1], "family00/003@0"]
-    nan = broken(good, [3], progress=np.nan)
-    for work, says in (
-        (lambda: pair(nan, good), "family00/003@0: progress: not a finite"),
-        (lambda: dataclasses.replace(both, ids=twice), "family00/003@0: met twice"),
-        (lambda: GateConfig(min_ttc=0), "min_ttc: 0: expected within"),
-        (lambda: GateConfig(primary=("reward",)), "primary: reward: expected some"),
-        (lambda: GateConfig(accept=("a/1@0", "a/1@0")), "accept: a/1@0: met twice"),
-    ):
-        with pytest.raises(InputError, match=says):
-            work()
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"min_ttc": 0}, "min_ttc: 0: expected within"),
+        ({"primary": ("reward",)}, "primary: reward: expected some"),
+        ({"primary": ()}, "primary: none: expected some"),
+        ({"accept": ("a/1@0", "a/1@0")}, "accept: a/1@0: met twice"),
+    ],
+)
+def test_bad_settings_are_one_line(wrong, says):
+    with pytest.raises(InputError, match=says):
+        GateConfig(**wrong)
 
 
 def test_sentences_fit_three_lines_however_much_is_wrong():
@@ -312,18 +288,6 @@ def test_sentences_fit_three_lines_however_much_is_wrong():
             )
             assert len(textwrap.wrap(verdict.sentence, 100)) <= 3
             assert "..." not in verdict.sentence
-
-
-def test_a_family_of_the_catalogue_is_called_by_its_title():
-    base, some = drives(), slice(3 * EACH, 4 * EACH)
-    made = pair(further(base, 0.8, some), base)
-    named = ["cut_in" if n == "family03" else n for n in made.families]
-    verdict = judge(dataclasses.replace(made, families=named), GateConfig())
-    assert 'less progress in "a car cuts in ahead"' in verdict.sentence
-    title = "A car cuts in ahead: progress"
-    assert check_of(verdict, "cut_in, progress").title == title
-    assert any(title in reason for reason in verdict.reasons)
-    assert title in format_verdict(verdict)
 
 
 def test_the_sentence_names_the_worst_family_and_the_json_says_the_same(tmp_path):
@@ -342,5 +306,4 @@ def test_the_sentence_names_the_worst_family_and_the_json_says_the_same(tmp_path
     assert (body["sentence"], body["decision"]) == (verdict.sentence, "do not ship")
     assert body["exit_code"] == EXIT_CODES[verdict.decision] == 3
     assert len(body["checks"]) == len(verdict.checks)
-    assert all(check["title"] for check in body["checks"])
     assert body["config"]["collision_free"] == config.collision_free

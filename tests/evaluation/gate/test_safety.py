@@ -1,6 +1,5 @@
 """Faults, accepted cases, trivial baselines and human-likeness in the gate."""
 
-import dataclasses
 import math
 import statistics
 
@@ -190,10 +189,6 @@ def test_what_was_not_measured_is_open_and_says_what_to_do():
     verdict = judge(pair(mine, drives(), trivial_baselines={}), GateConfig())
     assert verdict.decision == "could not judge"
     assert "drive constant V on the same cases" in verdict.reasons[0]
-    # where something is worse, that is said, not what is missing
-    slow = mine.replace(progress=0.9 * np.array(mine.progress))
-    verdict = judge(pair(slow, drives(), likeness=None), GateConfig())
-    assert verdict.decision == "do not ship"
 
 
 def test_behind_a_trivial_baseline_in_safety_is_refused():
@@ -243,16 +238,3 @@ def test_the_interval_of_likeness_is_over_recordings():
     few = judge_by(alone)
     assert few.decision == "could not judge"
     assert any("3 vehicles are too few" in reason for reason in few.reasons)
-
-
-def test_bad_likeness_is_one_line():
-    known = likeness()
-    few, bad = np.ones(3), np.where(np.arange(240) == 7, -1.0, 1.0)
-    without = {k: v for k, v in known.distance.items() if k != "+velocity"}
-    for distance, says in (
-        ({"candidate": few}, r"likeness: candidate: shape \(3,\): expec"),
-        ({"candidate": bad}, r"likeness: candidate: drive 7: -1\.0: expec"),
-        (without, r"likeness: \+velocity: expected a row of"),
-    ):
-        with pytest.raises(InputError, match=says):
-            judge_by(dataclasses.replace(known, distance=distance))
