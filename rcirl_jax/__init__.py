@@ -10,16 +10,8 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from rcirl_jax.api.runs import (
-        format_report,
-        gate,
-        import_logs,
-        rank,
-        read_logs,
-        simulate,
-        train_reward,
-        tune,
-    )
+    from rcirl_jax.api.logs import import_logs, read_logs
+    from rcirl_jax.api.runs import format_report, gate, rank, simulate, tune
     from rcirl_jax.api.scenes import (
         candidates_from,
         compute_features,
@@ -29,6 +21,7 @@ if TYPE_CHECKING:
         score_candidates,
         with_predicted_futures,
     )
+    from rcirl_jax.api.training import train_reward
     from rcirl_jax.data.store.dataset import open_dataset
     from rcirl_jax.errors import InputError
     from rcirl_jax.export.own_planner.builder import scene_from
@@ -67,10 +60,9 @@ __all__ = [
 _PLACES = {
     name: place
     for place, names in {
-        "api.runs": (
-            *("read_logs", "import_logs", "train_reward", "rank", "simulate", "gate"),
-            *("format_report", "tune"),
-        ),
+        "api.logs": ("import_logs", "read_logs"),
+        "api.training": ("train_reward",),
+        "api.runs": ("format_report", "gate", "rank", "simulate", "tune"),
         "api.scenes": (
             *(
                 "with_predicted_futures",

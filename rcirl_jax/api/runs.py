@@ -1,19 +1,14 @@
-"""From logs to a verdict: import, train, rank, simulate, gate, or all of it."""
+"""Ranks, drives and judges trained rewards, or goes through the whole loop."""
 
-import dataclasses
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from rcirl_jax.data import importing
-from rcirl_jax.data.formats import read_recordings
-from rcirl_jax.data.formats.recognise import recognised_format
-from rcirl_jax.data.importing import ImportConfig
-from rcirl_jax.data.inputs import input_files
-from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.api.logs import Place
+from rcirl_jax.api.training import folders_of, training_of
 from rcirl_jax.data.store.dataset import Dataset, open_dataset
-from rcirl_jax.data.store.joined import Demonstrations, open_datasets
+from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.likeness import DRIVES
 from rcirl_jax.evaluation.closed_loop.suite import (
@@ -27,199 +22,18 @@ from rcirl_jax.evaluation.gate.words import format_verdict
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.report import RankingReport, format_table
 from rcirl_jax.export.closed_loop import SuiteJob, run_job
-from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.gate_job import gate_job, judged
 from rcirl_jax.export.loading import load_runs, open_reward
-from rcirl_jax.export.reader import Reward
-from rcirl_jax.reward import RewardConfig
-from rcirl_jax.runtime.checked import typed_fields
 from rcirl_jax.runtime.executors import Executor, Serial
 from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.runtime.provenance import provenance
 from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.simulation.suite import case_duration, suite_refs
-from rcirl_jax.train.loop import Running, train
-from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.train.loop import Running
 from rcirl_jax.tuning.loop import tune as run_stages
-from rcirl_jax.tuning.recipes import (
-    DEFAULT,
-    NOT_OF_A_RECIPE,
-    PRESETS_OWN,
-    TuneConfig,
-    load_recipe,
-    override,
-)
+from rcirl_jax.tuning.recipes import DEFAULT, TuneConfig, load_recipe
 from rcirl_jax.tuning.run import Run
 from rcirl_jax.tuning.stages import verdict_of
-from rcirl_jax.types import Recording
-
-Place = str | os.PathLike[str]
-
-
-def read_logs(
-    path: Place, *, format: str | None = None, source: Place | None = None
-) -> Iterator[Recording]:
-    """Read the recordings of a log, one at a time, before anything is made of them.
-
-    Args:
-      path: file or folder.
-      format: one of docs/formats, for example "csv"; None: recognised by names of
-        files and columns.
-      source: TOML that says what columns mean and which units they have; None: the
-        one of the format.
-
-    Returns:
-      Recordings: tracks (positions in m, headings in rad, speeds in m/s, times in s),
-      lanes and signals.
-
-    Raises:
-      InputError: nothing there, a format that nobody knows, or a log that is not as its
-        format says.
-
-    Examples:
-        >>> for recording in rcirl_jax.read_logs("traffic.toml"):
-        ...     print(recording.name, recording.rate_hz, len(recording.lanes))
-        highway_straight-01-000 10.0 4
-        highway_straight-01-001 10.0 4
-    """
-    where, toml = _paths(path, source)
-    return read_recordings(format or recognised_format(where, toml), where, toml)
-
-
-def import_logs(
-    path: Place,
-    output: Place,
-    *,
-    format: str | None = None,
-    source: Place | None = None,
-    test_fraction: float = 0.25,
-    overwrite: bool = False,
-    executor: Executor | None = None,
-    **collect: float | bool,
-) -> Dataset:
-    """Import a log into a dataset of scenes and what people did in them.
-
-    An import that was interrupted goes on where it was when it is called again.
-
-    Args:
-      path: as `read_logs`.
-      output: folder of the dataset, or a tensorstore URL (`gs://`, `s3://`).
-      format: as `read_logs`.
-      source: as `read_logs`.
-      test_fraction: share of scenes held out; no vehicle is on both sides.
-      overwrite: replace a finished dataset.
-      executor: where logs are read, of `rcirl_jax.runtime.executors`; None: this
-        process. The dataset is the same byte for byte.
-      **collect: how scenes are cut out, by the fields of `CollectConfig`; among them
-        `stride_s`, s between two scenes of one driver, and `min_future_s`, s of record
-        that a scene needs; `require_obstacles=False` and `require_speed_change=False`
-        keep the scenes that the paper drops.
-
-    Returns:
-      The dataset, open. `dataset.manifest.quality` is the report on the log.
-
-    Raises:
-      InputError: bad input, after which nothing stays on disk, or a dataset that is
-        there already.
-
-    Examples:
-        >>> dataset = rcirl_jax.import_logs(
-        ...     "traffic.toml", "other", stride_s=4.0, require_obstacles=False
-        ... )
-        >>> dataset.count > 50
-        True
-    """
-    settings = typed_fields(CollectConfig, collect, "import_logs: ", ("signal_checks",))
-    where, toml = _paths(path, source)
-    form = format or recognised_format(where, toml)
-    config = ImportConfig(
-        format=form, collect=CollectConfig(**settings), test_fraction=test_fraction
-    )
-
-    def sign(dataset: Dataset) -> None:
-        flags = {"input": str(where), "format": form, **dataclasses.asdict(config)}
-        made_by = {"flags": flags, **provenance()}
-        dataset.write_facts({"data_hash": dataset.hash, "made_by": made_by})
-
-    importing.import_logs(
-        input_files(form, where, toml),
-        os.fspath(output),
-        config,
-        executor=executor,
-        overwrite=overwrite,
-        before_commit=sign,
-    )
-    return open_dataset(output, verify=False)
-
-
-def _paths(path: Place, source: Place | None) -> tuple[Path, Path | None]:
-    return Path(path), None if source is None else Path(source)
-
-
-def train_reward(
-    data: Place | Sequence[Place] | Demonstrations,
-    workdir: Place,
-    *,
-    recipe: str = DEFAULT,
-    seed: int = 0,
-    **settings: Any,  # noqa: ANN401
-) -> Reward:
-    """Train a reward on the training scenes of a dataset, and write its weights.
-
-    The weights are WORKDIR/weights.msgpack. A training that was interrupted goes on
-    where it was when it is called again; one that is done is not done again. The
-    reward stands alone: `tune` adds a recipe's simulated demonstrations and prior cost.
-
-    Args:
-      data: a dataset, its folder, or the folders of several, which count alike.
-      workdir: folder of the run: checkpoints, metrics, weights.
-      recipe: name in data_specs/recipes ("tuned", "paper", "quick"), or a TOML file.
-      seed: of initial weights, batches and candidates.
-      **settings: in place of the recipe's: fields of `TrainConfig` and `RewardConfig`,
-        for example `epochs=40`, `loss="listwise"`, `hidden=(15,)`, `constraint="none"`.
-
-    Returns:
-      The reward as `load_weights` reads it.
-
-    Raises:
-      InputError: a setting that cannot be, a workdir of other settings or data, or a
-        scene with a feature that is not finite.
-      Interrupted: the process was told to end; the last step is saved.
-
-    Examples:
-        >>> reward = rcirl_jax.train_reward("data", "run", recipe="quick", epochs=1)
-        >>> reward.preset, len(reward.names)
-        ('paper21', 21)
-        >>> rcirl_jax.load_weights("run/weights.msgpack").sha256 == reward.sha256
-        True
-    """
-    config = training_of(recipe, seed, settings)
-    config.reward.check_own()
-    folder = Path(workdir)
-    named = folders_of(data)
-    dataset = cast(Demonstrations, data) if named is None else open_datasets(named)
-    flags = {"data": named, "recipe": recipe, "seed": seed, **settings}
-    train(dataset, folder, config, provenance={"flags": flags, **provenance()})
-    return export_run(folder, dataset, folder / "weights.msgpack")
-
-
-def training_of(recipe: str, seed: int, settings: Mapping[str, Any]) -> TrainConfig:
-    """The training of a recipe with settings in place of its own."""
-    names = {field.name for field in dataclasses.fields(RewardConfig)}
-    of_reward = {name: settings[name] for name in settings if name in names}
-    rest = {name: settings[name] for name in settings if name not in names}
-    given = typed_fields(TrainConfig, rest, "settings: ", NOT_OF_A_RECIPE)
-    given |= typed_fields(RewardConfig, of_reward, "settings: ", PRESETS_OWN)
-    return override(load_recipe(recipe).train, given, seed=seed)
-
-
-def folders_of(data: object) -> list[str] | None:
-    """Folders by name; None for a dataset that is open."""
-    if isinstance(data, str | os.PathLike):
-        return [os.fspath(data)]
-    if isinstance(data, Sequence):
-        return [os.fspath(one) for one in data]
-    return None
 
 
 def rank(
