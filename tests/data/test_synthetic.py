@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from rcirl_jax.data.formats.synthetic import reader as synthetic
 from rcirl_jax.data.formats.synthetic.roads import ROADS
 from rcirl_jax.data.formats.synthetic.traffic import (
-    DRIVER,
+    CAR,
     Neighbours,
-    State,
     idm_acceleration,
 )
 from rcirl_jax.data.recording import validate_recording
@@ -175,12 +174,8 @@ def test_lane_changes_happen_and_are_smooth(default):
     assert sum(abs(track.y[-1] - track.y[0]) > 2.5 for track in tracks) > 30
 
 
-# one driver and car for everybody; values inside the human ranges
-SAME = {
-    **{"speed_factor": 1.0, "headway": 1.3, "jam_gap": 2.0, "acceleration": 1.8},
-    **{"deceleration": 2.0, "delay": 0.0, "lateral": 2.0, "threshold": 1e6},
-    **{"length": 4.5, "width": 1.8, "destination": np.inf, "drift": 0.0},
-}
+SAME = {"headway_s": 1.3, "jam_gap_m": 2.0}
+SAME |= {"acceleration_mps2": 1.8, "deceleration_mps2": 2.0}
 
 
 def closed_form_gap(v: float, v0: float) -> float:
@@ -191,7 +186,7 @@ def closed_form_gap(v: float, v0: float) -> float:
 @settings(max_examples=20)
 @given(st.floats(0.0, 28.0))
 def test_idm_is_at_rest_in_its_equilibrium_gap(v):
-    driver = np.zeros((), DRIVER)
+    driver = np.zeros((), CAR)
     for name, value in SAME.items():
         driver[name] = value
     now = np.array(v)
@@ -203,24 +198,20 @@ def test_idm_is_at_rest_in_its_equilibrium_gap(v):
 
 def test_neighbour_search_equals_brute_force():
     rng = np.random.default_rng(0)
-    state = State(3, 12)
-    state.s = rng.uniform(0.0, 300.0, state.s.shape)
-    state.lane = rng.integers(0, 3, state.s.shape)
-    state.old_lane = rng.integers(0, 3, state.s.shape)
-    state.phase = rng.choice([0.5, 1.0], state.s.shape)
-    state.vehicle = rng.integers(-1, 9, state.s.shape)
-    around = Neighbours(state, 3)
-    lanes = state.occupied()
-    leader, ahead = around.leader(lanes)
-    _, behind = around.follower(lanes)
-    for r, i in np.ndindex(*state.s.shape):
-        rest = [j for j in range(12) if lanes[r, i] & lanes[r, j] and j != i]
-        steps = np.array([state.s[r, j] - state.s[r, i] for j in rest])
-        front, back = steps[steps > 0], -steps[steps < 0]
-        assert ahead[r, i] == (front.min() if front.size else np.inf)
-        assert behind[r, i] == (back.min() if back.size else np.inf)
-        if front.size:
-            assert state.s[r, leader[r, i]] - state.s[r, i] == ahead[r, i]
+    cars = np.zeros(36, CAR)
+    cars["s"], cars["phase"] = rng.uniform(0.0, 300.0, 36), rng.choice([0.5, 1.0], 36)
+    cars["row"], cars["old_row"] = rng.integers(0, 5, (2, 36))
+    look = rng.integers(0, 6, 36)
+    for ahead in (True, False):
+        found, distance = Neighbours(cars).find(look, ahead)
+        for i, row in enumerate(look):
+            there = (cars["row"] == row) | (cars["phase"] < 1) & (
+                cars["old_row"] == row
+            )
+            step = (cars["s"] - cars["s"][i]) * (1 if ahead else -1)
+            step = np.where(there & (step > 0.0), step, np.inf)
+            assert distance[i] == step.min()
+            assert np.isinf(step.min()) or found[i] == step.argmin()
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,6 @@ shoulder or parking strip), where drivers stop at their destination.
 
 import dataclasses
 import itertools
-from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 
@@ -21,23 +19,15 @@ from rcirl_jax.types import Lane
 
 GRID_M = 0.5  # m between grid points of the reference line
 CENTRE_STEP_M = 2.0  # m between points of an emitted lane centre
-HIGHWAY_LANE_M = 3.6  # m, lane width (12 ft; AASHTO Green Book)
-URBAN_LANE_M = 3.5  # m, lane width (German RASt 06: 3.25 to 3.50 m)
-HIGHWAY_TRUCK_SHARE, URBAN_TRUCK_SHARE = 0.13, 0.05  # 1 (German counts: 5-20 %)
-HIGHWAY_TRUCK_M, URBAN_TRUCK_M = (8.0, 14.0), (6.5, 9.0)  # m, shortest, longest
 LATERAL_REFERENCE_MPS2 = 2.0  # m/s^2, comfort bound in curves (AASHTO: about 0.2 g)
 CURVE_BRAKING_MPS2 = 1.2  # m/s^2, deceleration with which drivers enter curves
 LIMIT_BRAKING_MPS2 = 0.8  # m/s^2, deceleration towards a lower speed limit
-STOP_CLEARANCE_M = 60.0  # m around stop lines without destinations
-STRAIGHT_KAPPA = 0.004  # 1/m, no destinations and lane changes in sharper bends
+CLEAR_M = 60.0  # m before a stop line or bend without lane changes and destinations
+CLEAR_BEHIND_M = 10.0  # m behind it without lane changes
+CHANGE_AFTER_ENTRY_M = 45.0  # m after the road's start without lane changes
+STRAIGHT_KAPPA = 0.004  # 1/m, a sharper curve is a bend
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Stop:
-    """A stop line across all lanes."""
-
-    station: float  # m
-    is_sign: bool  # a stop sign; else a traffic light
+Knots = list[tuple[float, float]]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -51,16 +41,20 @@ class Road:
     heading: np.ndarray  # [g] rad
     kappa: np.ndarray  # [g] 1/m
     limit: np.ndarray  # [g] m/s
+    lights: tuple[float, ...]  # m, stop lines of traffic lights
+    signs: tuple[float, ...]  # m, stop lines of stop signs
     truck_share: float
     truck_length: tuple[float, float]  # m, shortest and longest
-    stops: tuple[Stop, ...] = ()
-    # s of green, yellow and red in a signal's cycle
-    cycle: tuple[float, float, float] = (22.0, 4.0, 24.0)
 
     @property
     def length(self) -> float:
         """Length of the reference line, m."""
         return (self.x.size - 1) * GRID_M
+
+    @property
+    def stops(self) -> np.ndarray:
+        """Stations [n] m of all stop lines, lights first."""
+        return np.array(self.lights + self.signs)
 
     def offset(self, lane: np.ndarray | int) -> np.ndarray:
         """Lateral offset [m] of lane centres; the strip is lane `num_lanes`."""
@@ -75,16 +69,25 @@ class Road:
         kappa = np.maximum(np.abs(self.kappa), 1e-5)
         return _envelope(np.sqrt(LATERAL_REFERENCE_MPS2 / kappa), CURVE_BRAKING_MPS2)
 
-    def parking(self) -> np.ndarray:
-        """Stations [m] where destinations may lie."""
+    def _clear(self, behind_m: float) -> np.ndarray:
+        """[g] bool: no bend or stop line from CLEAR_M ahead to `behind_m` behind."""
+        busy = np.abs(self.kappa) > STRAIGHT_KAPPA
+        busy[np.round(self.stops / GRID_M).astype(int)] = True
+        count = np.concatenate([[0], np.cumsum(busy)])
+        at = np.arange(busy.size)
+        ahead = np.minimum(at + int(CLEAR_M / GRID_M) + 1, busy.size)
+        return count[ahead] == count[np.maximum(at - int(behind_m / GRID_M), 0)]
+
+    def changes_allowed(self) -> np.ndarray:
+        """[g] bool: lane changes may begin here."""
         s = np.arange(self.x.size) * GRID_M
-        free = (s > 0.35 * self.length) & (s < 0.88 * self.length)
-        bend = np.abs(self.kappa) > STRAIGHT_KAPPA
-        for where in s[bend][:: int(10.0 / GRID_M)]:
-            free &= np.abs(s - where) > STOP_CLEARANCE_M
-        for stop in self.stops:
-            free &= np.abs(s - stop.station) > STOP_CLEARANCE_M
-        return s[free]
+        return self._clear(CLEAR_BEHIND_M) & (s > CHANGE_AFTER_ENTRY_M)
+
+    def parking(self) -> np.ndarray:
+        """Stations [n] m where destinations may lie."""
+        s = np.arange(self.x.size) * GRID_M
+        middle = (s > 0.35 * self.length) & (s < 0.88 * self.length)
+        return s[self._clear(CLEAR_M) & middle]
 
 
 def _envelope(speed: np.ndarray, braking: float) -> np.ndarray:
@@ -125,48 +128,34 @@ def lanes(road: Road) -> tuple[Lane, ...]:
     """Return the road's lanes, cut at stop lines and limit changes, and its strip.
 
     Piece p of lane k is named "k.p"; the strip is lane `num_lanes`. A stop line
-    belongs to the piece that ends at it and is governed by signal "signal-i".
+    belongs to the piece that ends at it; light i is "signal-i".
     """
     changes = np.flatnonzero(np.diff(road.limit)) * GRID_M
-    inner = {float(s) for s in changes} | {stop.station for stop in road.stops}
-    cuts = [0.0, *sorted(inner), road.length]
-    number_at = {stop.station: i for i, stop in enumerate(road.stops)}
-    edges = np.array([0.5, -0.5]) * road.lane_width
+    cuts = np.unique([0.0, *changes, *road.stops, road.length]).tolist()
     made = []
     for k in range(road.num_lanes + 1):
         on_road = k < road.num_lanes
         for p, (start, end) in enumerate(itertools.pairwise(cuts)):
-            count = max(int(np.ceil((end - start) / CENTRE_STEP_M)), 1) + 1
-            s = np.linspace(start, end, count)
-            x, y, _ = to_world(road, s, np.full(count, road.offset(k)), 0.0 * s)
-            half = np.full(count, 0.5 * road.lane_width)
-            line, signs = None, False
-            signals: tuple[str, ...] = ()
-            if on_road and end in number_at:
-                i = number_at[end]
-                ends = to_world(
-                    road, np.full(2, end), road.offset(k) + edges, np.zeros(2)
-                )
-                line, signs = np.stack(ends[:2], axis=1), road.stops[i].is_sign
-                signals = () if signs else (f"signal-{i}",)
+            s = np.linspace(start, end, int(np.ceil((end - start) / CENTRE_STEP_M)) + 1)
+            x, y, _ = to_world(road, s, np.full(s.size, road.offset(k)), 0.0 * s)
+            edges = road.offset(k) + np.array([0.5, -0.5]) * road.lane_width
+            line = to_world(road, np.full(2, end), edges, np.zeros(2))[:2]
+            light, sign = on_road and end in road.lights, on_road and end in road.signs
             piece = Lane(
                 id=f"{k}.{p}",
                 centre=np.stack([x, y], axis=1),
-                left_width=half,
-                right_width=half.copy(),
+                left_width=np.full(s.size, 0.5 * road.lane_width),
+                right_width=np.full(s.size, 0.5 * road.lane_width),
                 speed_limit=float(road.limit[int(0.5 * (start + end) / GRID_M)]),
                 successors=() if end == cuts[-1] else (f"{k}.{p + 1}",),
                 left=f"{k - 1}.{p}" if k > 0 else None,
                 right=f"{k + 1}.{p}" if on_road else None,
-                stop_line=line,
-                signal_ids=signals,
-                stop_sign=signs,
+                stop_line=np.stack(line, axis=1) if light or sign else None,
+                signal_ids=(f"signal-{road.lights.index(end)}",) if light else (),
+                stop_sign=sign,
             )
             made.append(piece)
     return tuple(made)
-
-
-Knots = list[tuple[float, float]]
 
 
 def _road(
@@ -174,17 +163,20 @@ def _road(
     knots: Knots,
     limits: Knots,
     *,
-    stops: tuple[Stop, ...] = (),
+    lights: tuple[float, ...] = (),
+    signs: tuple[float, ...] = (),
     highway: bool = False,
 ) -> Road:
-    """A road from its curvature and limits.
+    """Returns a road.
 
     Args:
       length: m.
       knots: (station m, curvature 1/m), linear in between; empty: straight.
       limits: (from station m, limit m/s).
-      stops: its stop lines.
-      highway: three wide lanes with long trucks; else two urban lanes.
+      lights: m, stop lines of traffic lights.
+      signs: m, stop lines of stop signs.
+      highway: three lanes of 3.6 m (12 ft; AASHTO Green Book) with long trucks; else
+        two of 3.5 m (German RASt 06: 3.25 to 3.50 m). German counts: 5 to 20 % trucks.
     """
     s = np.arange(int(round(length / GRID_M)) + 1) * GRID_M
     stations, values = np.array(knots or [(0.0, 0.0)]).T
@@ -196,15 +188,16 @@ def _road(
     starts, speeds = np.array(limits).T
     return Road(
         num_lanes=3 if highway else 2,
-        lane_width=HIGHWAY_LANE_M if highway else URBAN_LANE_M,
+        lane_width=3.6 if highway else 3.5,
         x=np.concatenate([[0.0], np.cumsum(np.cos(chord) * GRID_M)]),
         y=np.concatenate([[0.0], np.cumsum(np.sin(chord) * GRID_M)]),
         heading=heading,
         kappa=kappa,
         limit=speeds[np.searchsorted(starts, s, side="left").clip(1) - 1],
-        stops=stops,
-        truck_share=HIGHWAY_TRUCK_SHARE if highway else URBAN_TRUCK_SHARE,
-        truck_length=HIGHWAY_TRUCK_M if highway else URBAN_TRUCK_M,
+        lights=lights,
+        signs=signs,
+        truck_share=0.13 if highway else 0.05,
+        truck_length=(8.0, 14.0) if highway else (6.5, 9.0),
     )
 
 
@@ -222,26 +215,14 @@ def _turn(side: float, radius: float) -> Road:
     return _road(520.0, _arc(230.0, clothoid, arc, side / radius), [(0.0, 13.9)])
 
 
-ROADS: dict[str, Callable[[], Road]] = {
-    "highway_straight": partial(_road, 1100.0, [], [(0.0, 30.0)], highway=True),
-    # bends of R = 500 m and 300 m, the limit falls
-    "highway_s_curve": partial(
-        _road,
-        1100.0,
-        _arc(150.0, 80.0, 180.0, 1 / 500.0) + _arc(560.0, 80.0, 150.0, -1 / 300.0),
-        [(0.0, 27.8), (500.0, 22.2)],
-        highway=True,
-    ),
-    "arterial_signals": partial(
-        _road,
-        800.0,
-        [],
-        [(0.0, 16.7)],
-        stops=tuple(Stop(station=s, is_sign=False) for s in (300.0, 580.0)),
-    ),
-    "urban_turn_left": partial(_turn, 1.0, 18.0),
-    "urban_turn_right": partial(_turn, -1.0, 22.0),
-    "stop_sign": partial(
-        _road, 480.0, [], [(0.0, 13.9)], stops=(Stop(station=260.0, is_sign=True),)
-    ),
+# bends of R = 500 m and 300 m, in between the limit falls
+_S_CURVE = _arc(150.0, 80.0, 180.0, 1 / 500.0) + _arc(560.0, 80.0, 150.0, -1 / 300.0)
+_S_LIMITS = [(0.0, 27.8), (500.0, 22.2)]
+ROADS: dict[str, Road] = {
+    "highway_straight": _road(1100.0, [], [(0.0, 30.0)], highway=True),
+    "highway_s_curve": _road(1100.0, _S_CURVE, _S_LIMITS, highway=True),
+    "arterial_signals": _road(800.0, [], [(0.0, 16.7)], lights=(300.0, 580.0)),
+    "urban_turn_left": _turn(1.0, 18.0),
+    "urban_turn_right": _turn(-1.0, 22.0),
+    "stop_sign": _road(480.0, [], [(0.0, 13.9)], signs=(260.0,)),
 }
