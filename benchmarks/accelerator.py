@@ -143,7 +143,7 @@ def _driven(device: Any, cases: int) -> CaseMetrics:  # noqa: ANN401
     refs = suite_refs("smoke")
     refs = refs[:: max(1, len(refs) // cases)][:cases]
     with jax.default_device(device):
-        row = baseline_row("hand-set", "paper21", untrained()[1], RankConfig())
+        row = baseline_row("hand-set", "paper21", untrained(), RankConfig())
         measure = functools.partial(case_metrics, config=MetricsConfig())
         config = rollout_config(row, SMOKE_S, plan_every=1)
         world = build(refs, SMOKE_S)

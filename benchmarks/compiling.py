@@ -22,15 +22,15 @@ from absl import app, flags
 
 from benchmarks.common import untrained, write
 from rcirl_jax.features import feature_map
+from rcirl_jax.planner.baselines import rule, rule_policy
 from rcirl_jax.planner.plan import no_plan
 from rcirl_jax.planner.prediction import with_predicted_futures
 from rcirl_jax.planner.rank import (
     ONLINE,
     RankConfig,
-    constant_speed_policy,
     hand_score,
-    learned_score,
-    rank_policy,
+    ranking,
+    ranking_policy,
 )
 from rcirl_jax.planner.safety import check
 from rcirl_jax.sampling import sample
@@ -64,14 +64,16 @@ def _rows() -> dict[str, Row]:
     draw = jax.vmap(lambda key, scene: sample(key, scene, ONLINE))
     candidates = jax.jit(draw)(keys, scenes)
     features = feature_map("paper21")
-    learned, weights = learned_score(features, "relu"), untrained()
-    policy = rank_policy(learned, RankConfig())
+    weights = untrained()
+    policy, ranked = ranking_policy(features, "relu", RankConfig()), ranking(weights)
     plan = jax.tree.map(lambda x: jnp.stack([x] * LANES), no_plan())
     asked, fallback = jnp.zeros(LANES), jnp.zeros(LANES, bool)
 
-    def loop(drive: Callable) -> Callable:
-        config = RolloutConfig(steps=STEPS, snapshots=True)
-        return rollout._compiled(drive, _reduced, config, None, True)
+    manner, config = RolloutConfig(steps=STEPS, snapshots=True).split()
+
+    def loop(drive: Callable, params: object) -> Row:
+        made = rollout._compiled(drive, _reduced, config, None, True)
+        return made, (params, cases, manner)
 
     return {
         "sampler": (draw, (keys, scenes)),
@@ -89,18 +91,15 @@ def _rows() -> dict[str, Row]:
         ),
         "ranking policy": (
             jax.vmap(policy, in_axes=(None, 0, 0)),
-            (weights, scenes, keys),
+            (ranked, scenes, keys),
         ),
         "with commitment": (
             jax.vmap(policy, in_axes=(None, 0, 0, 0)),
-            (weights, scenes, keys, plan),
+            (ranked, scenes, keys, plan),
         ),
-        "loop: constant speed": (loop(constant_speed_policy), (None, cases)),
-        "loop: learned": (loop(policy), (weights, cases)),
-        "loop: hand-set": (
-            loop(rank_policy(hand_score, RankConfig())),
-            (None, cases),
-        ),
+        "loop: driver models": loop(rule_policy, rule("IDM")),
+        "loop: learned": loop(policy, ranked),
+        "loop: hand-set": loop(policy, ranking(weights, "hand-set", (0.0, 0.0))),
     }
 
 

@@ -78,10 +78,10 @@ def main(_: list[str]) -> None:
     refs = every if _FULL.value else _part(every)
     duration_s = FULL_S if _FULL.value else _DURATION.value
     steps = round(duration_s / STEP_S)
-    normaliser = untrained()[1]
+    weights = untrained()
     result: dict = {"cases": len(refs), "duration_s": duration_s, "rows": {}}
     for name in ROWS:
-        row = baseline_row(name, "paper21", normaliser, RankConfig())
+        row = baseline_row(name, "paper21", weights, RankConfig())
         ways = _ways(row, refs, duration_s)
         taken = in_turn(ways, _ROUNDS.value + 1)
         first = {way: round(seconds[0], 2) for way, seconds in taken.items()}

@@ -13,10 +13,9 @@ from rcirl_jax.evaluation.gate import types as gate
 from rcirl_jax.evaluation.gate.verdict import MIN_CLUSTERS, judge, pair_of
 from rcirl_jax.evaluation.statistics import clopper_pearson
 from rcirl_jax.planner import rank
-from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.plan import Plan
 from rcirl_jax.reward.hand import LatticeCost
-from rcirl_jax.simulation.rows import Row
+from rcirl_jax.simulation.rows import Row, rule_row
 from rcirl_jax.types import Scene
 
 HAND_SET, IDM, OTHER = "hand-set", "IDM", "other candidates"
@@ -38,10 +37,11 @@ def made_rows() -> list[Row]:
     def other(p: rank.Params, s: Scene, key: jax.Array, *before: Plan | None) -> Plan:
         return policy(p, s, jax.random.fold_in(key, 1), *before)
 
-    rows = {HAND_SET: policy, OTHER: other, IDM: rank.idm_policy(Idm())}
+    rows = {HAND_SET: policy, OTHER: other}
     slower = {name: LatticeCost(speed_share=x).fields() for name, x in SLOWER.items()}
     return [
         *(Row(name=name, policy=made) for name, made in rows.items()),
+        rule_row(IDM, IDM),
         *(Row(name=name, policy=policy, params=p) for name, p in slower.items()),
     ]
 

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 
+from benchmarks.common import untrained
 from benchmarks.drawings.ideas import OTHER, bare, rectangle
 from rcirl_jax.export.closed_loop import incumbent_score, table_rows
 from rcirl_jax.export.loading import open_reward
@@ -110,7 +111,7 @@ def family_views(path: Path) -> None:
     """One moment of a case of every family, from above."""
     names = family_names()
     cases = catalogue_set([CaseRef(family=n, index=0) for n in names], FAMILY_S)
-    row = baseline_row("hand-set", "paper21", None, RankConfig())  # type: ignore[arg-type]
+    row = baseline_row("hand-set", "paper21", untrained(), RankConfig())
     replays: list[Replay] = []
     for first in range(0, len(names), MAX_CASES):
         replays += make_replays([row], cases, cases.ids[first : first + MAX_CASES], 1)

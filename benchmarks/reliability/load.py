@@ -84,8 +84,10 @@ def suite() -> list[str]:
         print(f"{row.name}: {found[row.name]}", flush=True)
         return made
 
-    norm = untrained()[1]
-    rows = [baseline_row(name, "paper21", norm, RankConfig()) for name in _ROWS.value]
+    weights = untrained()
+    rows = [
+        baseline_row(name, "paper21", weights, RankConfig()) for name in _ROWS.value
+    ]
     begin, config = time.monotonic(), SuiteConfig(chunk=_CHUNK.value)
     run_suite(rows, catalogue_set(cases, _DURATION.value), config, drive)
     result = {

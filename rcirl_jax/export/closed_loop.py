@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Annotated
 
 import jax
-import jax.numpy as jnp
 import msgspec
 import numpy as np
 
@@ -34,18 +33,17 @@ from rcirl_jax.export.loading import (
 )
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
+from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm, Yielding
 from rcirl_jax.planner.dp import DpConfig, dp_policy
 from rcirl_jax.planner.rank import (
     Params,
     RankConfig,
+    Ranking,
     Score,
-    WithPriorCost,
     hand_score,
-    idm_policy,
-    learned_score,
-    prior_cost_score,
     rank_policy,
+    ranking,
+    ranking_score,
 )
 from rcirl_jax.planner.safety import SafetyConfig
 from rcirl_jax.runtime.atomic_files import read_json, write_json
@@ -57,6 +55,7 @@ from rcirl_jax.simulation.rows import (
     Row,
     baseline_row,
     judges,
+    rule_row,
 )
 from rcirl_jax.simulation.suite import (
     CaseRef,
@@ -74,28 +73,20 @@ _IDM = msgspec.defstruct(
 )
 
 
-def score_of(reward: Reward) -> tuple[Score, Params]:
+def score_of(reward: Reward) -> tuple[Score, Ranking]:
     """What a weights file drives by: V, or its prior cost and V."""
-    features, params = feature_map(str(reward.preset)), reward_params(reward)
+    score = ranking_score(feature_map(str(reward.preset)), reward.activation)
     prior_cost = reward.prior_cost
     if prior_cost is None:
-        return learned_score(features, reward.activation), params
-    known = {"hand-set": hand_score}
-    if prior_cost.incumbent not in known:
+        return score, ranking(reward_params(reward))
+    if prior_cost.incumbent != "hand-set":
         raise InputError(
             f"{reward.file}: prior_cost.incumbent: {prior_cost.incumbent}: expected "
-            f"one of {', '.join(known)}, whose cost is known here"
+            "hand-set, whose cost is known here"
         )
-    score = prior_cost_score(features, reward.activation, known[prior_cost.incumbent])
-    effective, normaliser = params
-    return score, WithPriorCost(
-        reward=effective,
-        normaliser=normaliser,
-        familiarity=familiarity_of(prior_cost),
-        low=jnp.asarray(prior_cost.low, jnp.float32),
-        high=jnp.asarray(prior_cost.high, jnp.float32),
-        own=None,
-    )
+    gains = prior_cost.low, prior_cost.high
+    known = familiarity_of(prior_cost)
+    return score, ranking(reward_params(reward), prior_cost.incumbent, gains, known)
 
 
 def incumbent_score(name: str) -> tuple[Score, Params]:
@@ -144,9 +135,12 @@ def table_rows(
         every, name = max(plan_every, DP_EVERY), f"{rows[0].name} DP"
         row = Row(name=name, policy=policy, params=params, plan_every=every)
         rows.insert(1, row)
-    rows += [baseline_row(name, preset, params[1], config) for name in baselines]
+    rows += [
+        baseline_row(name, preset, params, config, first.activation)
+        for name in baselines
+    ]
     if tuned_idm is not None:
-        rows.append(Row(name=TUNED_IDM_ROW, policy=idm_policy(tuned_idm)))
+        rows.append(rule_row(TUNED_IDM_ROW, "IDM", Yielding(idm=tuned_idm)))
     return rows
 
 

@@ -9,12 +9,21 @@ It stands in for a human where demonstrations are made rather than recorded,
 and is a baseline row of its own. Along the path it is an IDM; a body that
 crosses becomes a wall at its near edge while the ego would arrive within the
 time gap that the driver keeps (gap acceptance, HCM 2010 ch. 19).
+
+Two careful drivers say who could have avoided a collision. They drive like the one that
+gives way, with wide margins, and brake harder at a risk.
+
+CC, the competent and careful human driver of UN R157 annex 3: perceives a risk when a
+body is in its path, or enters it, with a time to collision of at most 2 s; 0.75 s later
+it brakes, building up 12.65 m/s^3 to 0.774 g. FSM, the fuzzy safety model of the JRC:
+brakes by how far the gap lies between a safe and an unsafe distance, before the
+conflict (PFS) and in it (CFS).
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 
@@ -29,12 +38,8 @@ TUNED_IDM_ROW = "IDM, tuned"  # name of its row in all tables
 IN_WAY_M = 0.2  # m, lateral buffer within which an obstacle is a leader
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Idm:
-    """Intelligent Driver Model (Treiber, Hennecke, Helbing 2000), usual values.
-
-    Any field may be traced.
-    """
+class Idm(flax.struct.PyTreeNode, kw_only=True):
+    """Intelligent Driver Model (Treiber, Hennecke, Helbing 2000), usual values."""
 
     headway: float | jax.Array = 1.5  # s
     standstill_gap: float | jax.Array = 2.0  # m
@@ -121,26 +126,25 @@ def closeness(trajectory: Trajectory, other: Trajectory, valid: jax.Array) -> ja
     return -jnp.sum(jnp.where(valid, apart, 0.0)) / jnp.sum(valid)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Yielding:
-    """Parameters of the driver; hashable."""
+class Yielding(flax.struct.PyTreeNode, kw_only=True):
+    """Parameters of the driver that gives way."""
 
-    idm: Idm = dataclasses.field(default_factory=Idm)
+    idm: Idm = Idm()
     # 1, share of the planner's speed limit that is driven
-    limit_share: float = 0.97
+    limit_share: float | jax.Array = 0.97
     # s kept between a crossing body and the ego at the conflict
-    time_gap: float = 1.2
+    time_gap: float | jax.Array = 1.2
     # m kept to the near edge of a crossing body
-    distance_gap: float = 2.0
+    distance_gap: float | jax.Array = 2.0
     # m added to the half widths when the path is searched for bodies
-    margin: float = 0.35
+    margin: float | jax.Array = 0.35
     # m/s sideways above which a body crosses
-    crossing_speed: float = 0.7
+    crossing_speed: float | jax.Array = 0.7
     # s within which somebody who enters the lane ahead counts as the leader
-    entering: float = 2.5
+    entering: float | jax.Array = 2.5
 
 
-def _in_path(scene: Scene, margin: float) -> jax.Array:
+def _in_path(scene: Scene, margin: float | jax.Array) -> jax.Array:
     """[N, T] bool: the body's box reaches into the strip the ego will drive."""
     o = scene.obstacles
     middle = 0.5 * (o.s_lower + o.s_upper)
@@ -235,14 +239,128 @@ def _drives_along(o: Obstacles) -> jax.Array:
     return o.speed[:, 0] > 1.5 * sideways
 
 
-@functools.lru_cache(maxsize=16)
-def yielding_policy(driver: Yielding) -> Callable[..., Plan]:
-    """The driver as a policy of the simulator."""
+USUAL = Yielding()
+RISK_TTC_S = 2.0  # s, CC
+REACTION_S = 0.75  # s
+BRAKING = 7.59  # m/s^2, CC: 0.774 g
+BRAKING_JERK = 12.65  # m/s^3
+B_MIN, B_MAX = 4.0, 6.0  # m/s^2, FSM: comfortable and hard
+B_LEADER = 7.0  # m/s^2, FSM: assumed of the leader
+STANDING_GAP_M = 2.0  # m, FSM
+# their driving between risks: wide margins, early yielding
+CAREFUL = Yielding(
+    idm=Idm(headway=1.8, acceleration=1.2, braking=1.6, standstill_gap=3.0),
+    limit_share=0.92,
+    time_gap=1.8,
+    distance_gap=3.0,
+    margin=0.5,
+    entering=4.0,
+)
 
-    def policy(
-        params: None, scene: Scene, key: jax.Array, before: Plan | None = None
-    ) -> Plan:
-        del params, key, before
-        return held(scene.ego.v, acceleration(scene, driver))
 
-    return policy
+def cc_braking(
+    gap: jax.Array, v: jax.Array, a: jax.Array, v_lead: jax.Array
+) -> jax.Array:
+    """Braking m/s^2 >= 0 of the CC driver: full at a risk, otherwise 0."""
+    del a
+    closing = jnp.maximum(v - v_lead, 1e-3)
+    return jnp.where(gap / closing <= RISK_TTC_S, BRAKING, 0.0)
+
+
+def fsm_braking(
+    gap: jax.Array, v: jax.Array, a: jax.Array, v_lead: jax.Array
+) -> jax.Array:
+    """Braking m/s^2 >= 0 of the fuzzy safety model.
+
+    PFS: d_safe = v tau + v^2 / 2 b_min - v_l^2 / 2 b_l + 2, d_unsafe with b_max
+         PFS = clip((d - 2 - d_safe) / (d_unsafe - d_safe), 0, 1)
+    CFS: d_safe = (v + a tau / 2 - v_l) tau + (v + a tau - v_l)^2 / 2 b_min
+    brake = CFS (b_max - b_min) + b_min where CFS > 0, else PFS b_min
+    """
+    lead = v_lead**2 / (2.0 * B_LEADER)
+
+    def proactive(b: float) -> jax.Array:
+        return v * REACTION_S + v**2 / (2.0 * b) - lead + STANDING_GAP_M
+
+    def critical(b: float) -> jax.Array:
+        slow = jnp.maximum(a, -B_MIN)
+        later = jnp.maximum(v + slow * REACTION_S, 0.0)
+        way = (v + 0.5 * slow * REACTION_S - v_lead) * REACTION_S
+        return way + jnp.maximum(later - v_lead, 0.0) ** 2 / (2.0 * b)
+
+    def share(d: jax.Array, safe: jax.Array, unsafe: jax.Array) -> jax.Array:
+        width = jnp.minimum(unsafe - safe, -1e-3)
+        return jnp.clip((d - safe) / width, 0.0, 1.0)
+
+    pfs = share(gap - STANDING_GAP_M, proactive(B_MIN), proactive(B_MAX))
+    cfs = share(gap, critical(B_MIN), critical(B_MAX))
+    cfs = jnp.where(v > v_lead, cfs, 0.0)
+    hard = cfs * (B_MAX - B_MIN) + B_MIN
+    return jnp.where(cfs > 0.0, hard, pfs * B_MIN)
+
+
+def _careful(braking: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+    """A driver that brakes by the hardest demand of any body in its path."""
+
+    def driven(scene: Scene, driver: Yielding) -> jax.Array:
+        gap, lead = bodies_in_path(scene, driver)
+        every = jax.vmap(braking, (0, None, None, 0))
+        brake = jnp.max(every(gap, scene.ego.v, scene.ego.a, lead))
+        a = acceleration(scene, driver)
+        return jnp.minimum(a, jnp.where(brake > 0.0, -brake, a))
+
+    return driven
+
+
+def _behind_the_nearest(scene: Scene, driver: Yielding) -> jax.Array:
+    """IDM behind the nearest body or line in the ego's corridor now."""
+    obstacles, ego = scene.obstacles, scene.ego
+    front = ego.s + 0.5 * ego.length
+    aside = jnp.maximum(
+        obstacles.l_lower[:, 0] - ego.l, ego.l - obstacles.l_upper[:, 0]
+    )
+    gap = obstacles.s_lower[:, 0] - front
+    in_way = aside < 0.5 * ego.width + IN_WAY_M
+    known = obstacles.valid[:, 0] & (obstacles.kind != Kind.NONE)
+    leads = known & in_way & (obstacles.s_upper[:, 0] > ego.s)
+    nearest = jnp.argmin(jnp.where(leads, gap, jnp.inf))
+    found = leads[nearest]
+    return idm_acceleration(
+        ego.v,
+        jnp.where(found, gap[nearest], 1e3),
+        jnp.where(found, ego.v - obstacles.speed[nearest, 0], 0.0),
+        scene.path.speed_limit[0],
+        driver.idm,
+    )
+
+
+# (scene, driver) -> acceleration [] m/s^2
+RULES = {
+    "constant speed": lambda scene, driver: jnp.zeros(()),
+    "IDM": _behind_the_nearest,
+    "IDM yielding": acceleration,
+    "CC": _careful(cc_braking),
+    "FSM": _careful(fsm_braking),
+}
+
+
+class Rule(flax.struct.PyTreeNode, kw_only=True):
+    """A driver model, as data: `rule` makes it, `rule_policy` drives by it."""
+
+    place: jax.Array  # [] in RULES
+    driver: Yielding  # its constants; IDM reads `driver.idm` only
+
+
+def rule(name: str, driver: Yielding = USUAL) -> Rule:
+    """The driver model of a name of `RULES`."""
+    numbers = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), driver)
+    return Rule(place=jnp.asarray(list(RULES).index(name)), driver=numbers)
+
+
+def rule_policy(
+    params: Rule, scene: Scene, key: jax.Array, before: Plan | None = None
+) -> Plan:
+    """All driver models as one policy of the simulator."""
+    del key, before
+    a = jax.lax.switch(params.place, [*RULES.values()], scene, params.driver)
+    return held(scene.ego.v, a)

@@ -197,7 +197,7 @@ def only_where(
         if jax.default_backend() != "cpu":
             axes = jax.tree.map(lambda x: 0 if x else None, batched[2])
             made = jax.vmap(make, axes, axis_size=size)(*args)
-            return jax.vmap(_either)(needed, made, otherwise), every
+            return jax.vmap(either)(needed, made, otherwise), every
 
         order = jnp.argsort(~needed)
 
@@ -213,7 +213,8 @@ def only_where(
     return chosen(needed, otherwise, args)
 
 
-def _either(yes: jax.Array, one: Tree, other: Tree) -> Tree:
+def either(yes: jax.Array | bool, one: Tree, other: Tree) -> Tree:
+    """Leaf by leaf `one` where `yes` [], else `other`."""
     return jax.tree.map(lambda a, b: jnp.where(yes, a, b), one, other)
 
 

@@ -25,10 +25,9 @@ import jax
 import jax.numpy as jnp
 
 from rcirl_jax.features import FeatureMap
-from rcirl_jax.planner.baselines import Idm, idm_acceleration
-from rcirl_jax.planner.plan import Plan, PreviousPlan, committed, held, plan_of
+from rcirl_jax.planner.plan import Plan, PreviousPlan, committed, either, plan_of
 from rcirl_jax.planner.safety import SafetyConfig, check, choose
-from rcirl_jax.reward.familiarity import Familiarity, familiarity
+from rcirl_jax.reward.familiarity import familiar_nowhere, familiarity
 from rcirl_jax.reward.hand import LatticeCost, lattice_costs
 from rcirl_jax.reward.network import (
     ACTIVATIONS,
@@ -36,12 +35,12 @@ from rcirl_jax.reward.network import (
     effective_model,
     scene_values,
 )
-from rcirl_jax.reward.speed_dp import speed_dp_cost
+from rcirl_jax.reward.speed_dp import SPEED_DP_ROW, speed_dp_cost
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.sampling.sampler import family_index
 from rcirl_jax.types import (
     Candidates,
-    Kind,
+    Familiarity,
     Normaliser,
     RewardParams,
     Scene,
@@ -154,6 +153,77 @@ def speed_dp_score(params: None, scene: Scene, candidates: Candidates) -> jax.Ar
     return -jax.vmap(lambda x: speed_dp_cost(scene, x))(candidates.trajectory)
 
 
+# what a planner may value candidates by without a learned reward
+OWN_SCORES: dict[str, Score] = {
+    "constant V": constant_score,
+    "hand-set": hand_score,
+    SPEED_DP_ROW: speed_dp_score,
+    "+velocity": velocity_score,
+}
+
+
+class Ranking(flax.struct.PyTreeNode, kw_only=True):
+    """What ranks candidates, V_own + gain V_learned; `ranking` makes it."""
+
+    own: jax.Array  # [] place in OWN_SCORES
+    low: jax.Array  # [] gain where nothing is known
+    high: jax.Array  # [] gain where all is
+    reward: RewardParams  # effective
+    normaliser: Normaliser
+    familiarity: Familiarity
+
+
+def ranking(
+    weights: tuple[RewardParams, Normaliser],
+    own: str = "constant V",
+    gains: tuple[float, float] = (1.0, 1.0),
+    known: Familiarity | None = None,
+) -> Ranking:
+    """Names what ranks; all of one network's shape are valued by one program.
+
+    Args:
+      weights: effective parameters and normaliser of the learned reward.
+      own: what it is added to, of OWN_SCORES.
+      gains: low and high; (0, 0) leaves the learned reward out.
+      known: the familiarity, which matters where the gains differ.
+    """
+    params, normaliser = weights
+    low, high = (jnp.asarray(gain, jnp.float32) for gain in gains)
+    return Ranking(
+        own=jnp.asarray(list(OWN_SCORES).index(own)),
+        low=low,
+        high=high,
+        reward=params,
+        normaliser=normaliser,
+        familiarity=known or familiar_nowhere(normaliser.scale.shape[0]),
+    )
+
+
+@functools.lru_cache(maxsize=16)
+def ranking_score(features: FeatureMap, activation: str) -> Score:
+    """Score of a `Ranking`, by the equation of the module.
+
+    Of the own scores and the learned one, only what the ranking names is computed.
+    """
+
+    def learned(params: Ranking, scene: Scene, candidates: Candidates) -> jax.Array:
+        rows = features.rows(scene, candidates)
+        model = effective_model(params.reward, activation)
+        values = value_rows(model, params.reward, params.normaliser, rows, scene)
+        x0 = jnp.stack([row[0, 0] for row in rows])
+        share = familiarity(params.familiarity, x0)
+        return (params.low + (params.high - params.low) * share) * values
+
+    def score(params: Ranking, scene: Scene, candidates: Candidates) -> jax.Array:
+        seen = scene, candidates
+        own = jax.lax.switch(params.own, [*OWN_SCORES.values()], None, *seen)
+        uses = (params.low != 0.0) | (params.high != 0.0)
+        nothing = lambda *_: jnp.zeros_like(own)  # noqa: E731
+        return own + jax.lax.cond(uses, learned, nothing, params, *seen)
+
+    return score
+
+
 def with_plan_in_force(
     candidates: Candidates, in_force: PreviousPlan | None
 ) -> Candidates:
@@ -204,7 +274,7 @@ def best_plan(
     keeps = known & verdict.admissible[-1] & (scores[-1] >= scores[index])
     keeps = keeps & (before.since < LONGEST_S)
     kept = before.replace(since_choice=jnp.zeros(()), admissible=count)
-    return jax.tree.map(lambda old, new: jnp.where(keeps, old, new), kept, fresh)
+    return either(keeps, kept, fresh)
 
 
 @functools.lru_cache(maxsize=64)
@@ -222,70 +292,6 @@ def rank_policy(score: Score, config: RankConfig) -> Policy:
     return committed(replan, config.sampler, config.safety, config.commitment)
 
 
-@functools.lru_cache(maxsize=8)
-def idm_policy(idm: Idm) -> Policy:
-    """IDM behind the nearest body or line in the ego's corridor now."""
-
-    def policy(
-        params: Params, scene: Scene, key: jax.Array, before: Plan | None = None
-    ) -> Plan:
-        del params, key, before
-        obstacles, ego = scene.obstacles, scene.ego
-        front = ego.s + 0.5 * ego.length
-        aside = jnp.maximum(
-            obstacles.l_lower[:, 0] - ego.l, ego.l - obstacles.l_upper[:, 0]
-        )
-        gap = obstacles.s_lower[:, 0] - front
-        in_way = aside < 0.5 * ego.width + 0.2
-        known = obstacles.valid[:, 0] & (obstacles.kind != Kind.NONE)
-        leads = known & in_way & (obstacles.s_upper[:, 0] > ego.s)
-        nearest = jnp.argmin(jnp.where(leads, gap, jnp.inf))
-        found = leads[nearest]
-        a = idm_acceleration(
-            ego.v,
-            jnp.where(found, gap[nearest], 1e3),
-            jnp.where(found, ego.v - obstacles.speed[nearest, 0], 0.0),
-            scene.path.speed_limit[0],
-            idm,
-        )
-        return held(ego.v, a)
-
-    return policy
-
-
-def constant_speed_policy(
-    params: Params, scene: Scene, key: jax.Array, before: Plan | None = None
-) -> Plan:
-    """The acceleration stays 0."""
-    del params, key, before
-    return held(scene.ego.v, jnp.zeros(()))
-
-
-class WithPriorCost(flax.struct.PyTreeNode, kw_only=True):
-    """Weights of a score with a prior cost."""
-
-    reward: RewardParams  # effective
-    normaliser: Normaliser
-    familiarity: Familiarity
-    low: jax.Array  # [] gain where nothing is known
-    high: jax.Array  # [] gain where all is
-    own: Params  # weights of the own cost
-
-
-def gain(params: WithPriorCost, rows: Sequence[jax.Array]) -> jax.Array:
-    """The gain [] of a scene from its candidates' raw features, F of [T, K]."""
-    x0 = jnp.stack([row[0, 0] for row in rows])
-    return params.low + (params.high - params.low) * familiarity(params.familiarity, x0)
-
-
-@functools.lru_cache(maxsize=16)
-def prior_cost_score(features: FeatureMap, activation: str, own: Score) -> Score:
-    """Score of `WithPriorCost`, by the equation of the module."""
-
-    def score(params: WithPriorCost, scene: Scene, candidates: Candidates) -> jax.Array:
-        rows = features.rows(scene, candidates)
-        model = effective_model(params.reward, activation)
-        values = value_rows(model, params.reward, params.normaliser, rows, scene)
-        return own(params.own, scene, candidates) + gain(params, rows) * values
-
-    return score
+def ranking_policy(features: FeatureMap, activation: str, config: RankConfig) -> Policy:
+    """The planner that drives by a `Ranking`."""
+    return rank_policy(ranking_score(features, activation), config)

@@ -8,27 +8,30 @@ recorded scenes from those of a catalogue (`tune.familiarity`), it is near 1 in 
 as people were recorded in it and near 0 elsewhere.
 """
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rcirl_jax.features import FeatureMap
+from rcirl_jax.types import Familiarity
 
+UNITS = 16  # H of the familiarity that is fitted here
 REACH = 5.0  # 1, |z| beyond which a feature counts as that far
 # functions of the trajectory's own time, equal in all scenes at t = 0
 OF_THE_TRAJECTORY = ("station", "time")
 
 
-class Familiarity(flax.struct.PyTreeNode, kw_only=True):
-    """Weights of the familiarity; H hidden units."""
-
-    location: jax.Array  # [F] in the feature's unit
-    scale: jax.Array  # [F] > 0
-    kernel: jax.Array  # [F, H] W
-    bias: jax.Array  # [H] b
-    out: jax.Array  # [H]
-    offset: jax.Array  # [] c
+def familiar_nowhere(size: int) -> Familiarity:
+    """Returns the familiarity of `size` features that says 0.5 of every scene."""
+    zeros = jnp.zeros
+    return Familiarity(
+        location=zeros(size),
+        scale=jnp.ones(size),
+        kernel=zeros((size, UNITS)),
+        bias=zeros(UNITS),
+        out=zeros(UNITS),
+        offset=zeros(()),
+    )
 
 
 def familiarity_logit(

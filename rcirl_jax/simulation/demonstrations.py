@@ -32,7 +32,7 @@ from rcirl_jax.data.store.manifest import Manifest
 from rcirl_jax.data.store.splits import assign_groups
 from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
-from rcirl_jax.planner.baselines import Idm, Yielding, yielding_policy
+from rcirl_jax.planner.baselines import Idm, Yielding, rule, rule_policy
 from rcirl_jax.runtime.compiling import CompilesFirst
 from rcirl_jax.simulation.cases import STEP_S, Case, Record
 from rcirl_jax.simulation.rollout import (
@@ -196,7 +196,8 @@ def _drive_all(
     with CompilesFirst(total=len(refs), desc="drive the catalogue", unit="case") as bar:
         for first in range(0, len(refs), CHUNK):
             part = refs[first : first + CHUNK]
-            model = yielding_policy(DRIVERS[first // CHUNK % len(DRIVERS)]), None
+            driver = DRIVERS[first // CHUNK % len(DRIVERS)]
+            model = rule_policy, rule("IDM yielding", driver)
             driven = _drives(part, first, who[0] or model, who[1], rollout, config)
             for ref, rows in zip(part, driven, strict=True):
                 number = len(names)

@@ -2,8 +2,8 @@
 
 The only file of the simulator that names `jit`, `vmap` or `scan` over cases and time.
 A policy is a pure function `(params, scene, key, before) -> Plan`, `before` being the
-plan in force; between two plans the ego follows the plan. Weights are arguments, so the
-compiled program serves every weights file of one shape.
+plan in force; between two plans the ego follows the plan. Weights and the manner of
+driving are arguments: the compiled program serves every row of one policy and shape.
 
 What is scanned is the step of all cases side by side: a scan under `vmap` would be
 traced once for one case and again for many.
@@ -17,12 +17,20 @@ import os
 from collections.abc import Callable
 from typing import Any
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.planner.plan import Plan, command, later, no_plan, stations_from_now
+from rcirl_jax.planner.plan import (
+    Plan,
+    command,
+    either,
+    later,
+    no_plan,
+    stations_from_now,
+)
 from rcirl_jax.simulation.agents import colours
 from rcirl_jax.simulation.cases import STEP_S, Case, Record, Snapshot, World
 from rcirl_jax.simulation.world import Vehicle, observe, road_limit, start, step
@@ -33,11 +41,12 @@ Policy = Callable[..., Plan]  # (params, scene, key, plan in force) -> Plan
 Logs = Any  # what a rollout returns: records, or what `reduce` made of them
 
 SAMPLER_STREAM = 7  # fold_in number of the sampler's key
+MAX_DELAY = 10  # steps by which commands may be late
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RolloutConfig:
-    """How a case is driven; hashable, a static argument."""
+    """How a case is driven; hashable. Its manner is data, the rest is static."""
 
     # steps between two plans: 1 plans at 10 Hz
     plan_every: int = 1
@@ -68,6 +77,31 @@ class RolloutConfig:
                 f"plan_every: {self.plan_every}: expected a divisor of the "
                 f"{self.steps} steps"
             )
+        if not 0 <= self.command_delay <= MAX_DELAY:
+            raise InputError(
+                f"command_delay: {self.command_delay}: expected 0 to {MAX_DELAY} steps"
+            )
+
+    def split(self) -> tuple["Manner", "RolloutConfig"]:
+        """The manner, and the configuration that all manners share."""
+        # a command held for a step moves the acceleration by this share of its way
+        share = 1.0 - math.exp(-STEP_S / self.vehicle.acceleration_lag)
+        jerk = math.inf if self.braking_jerk is None else self.braking_jerk
+        manner = Manner(
+            follow_log=jnp.asarray(self.follow_log),
+            command_delay=jnp.asarray(self.command_delay),
+            below=jnp.asarray(jerk * STEP_S / share, jnp.float32),
+        )
+        usual = {"follow_log": False, "command_delay": 0, "braking_jerk": None}
+        return manner, dataclasses.replace(self, **usual)
+
+
+class Manner(flax.struct.PyTreeNode, kw_only=True):
+    """The part of a `RolloutConfig` that is data; all []."""
+
+    follow_log: jax.Array  # bool
+    command_delay: jax.Array  # steps
+    below: jax.Array  # m/s^2 by which a command may be below the acceleration
 
 
 def rollout(
@@ -75,6 +109,7 @@ def rollout(
     params: Params,
     cases: Case,
     config: RolloutConfig,
+    manner: Manner,
     takeover_policy: Policy | None = None,
 ) -> tuple[jax.Array, Scene | None]:
     """Drive cases [B] from start to end, side by side.
@@ -101,17 +136,16 @@ def rollout(
             other = takeover_policy(params[1], scene, draw, before)
             first, second = config.takeover_schedule
             taken_over = now.step % (first + second) >= first
-            return jax.tree.map(lambda x, y: jnp.where(taken_over, x, y), other, plan)
+            return either(taken_over, other, plan)
 
     def tick(
         case: Case, now: World, waiting: jax.Array, plan: Plan
     ) -> tuple[tuple[World, jax.Array, Plan], jax.Array]:
-        asked = command(plan, now.ego.v)
-        waiting = jnp.concatenate([asked[None], waiting])
-        late, waiting = waiting[-1], waiting[:-1]
-        applied = _build_up(late, now.ego.a, config)
+        waiting = jnp.append(command(plan, now.ego.v), waiting[:-1])
+        late = waiting[manner.command_delay]
+        applied = jnp.maximum(late, now.ego.a - manner.below)
         after, record = step(
-            case, now, applied, plan.fallback, config.vehicle, config.follow_log
+            case, now, applied, plan.fallback, config.vehicle, manner.follow_log
         )
         shot = _snapshot(case, now, after, plan) if config.snapshots else None
         return (after, waiting, later(plan, STEP_S)), _packed((record, shot))
@@ -129,19 +163,10 @@ def rollout(
 
     count = cases.steps.shape[0]
     nothing = jax.tree.map(lambda x: jnp.stack([x] * count), no_plan())
-    begin = (jax.vmap(start)(cases), jnp.zeros((count, config.command_delay)), nothing)
+    begin = (jax.vmap(start)(cases), jnp.zeros((count, MAX_DELAY + 1)), nothing)
     plans = config.steps // config.plan_every
     _, (logs, scenes) = jax.lax.scan(plan_and_drive, begin, length=plans)
     return logs.reshape(config.steps, count, -1), scenes
-
-
-def _build_up(command: jax.Array, a: jax.Array, config: RolloutConfig) -> jax.Array:
-    """The command, no farther below the present acceleration than the jerk allows."""
-    if config.braking_jerk is None:
-        return command
-    lag = config.vehicle.acceleration_lag
-    reach = STEP_S / (1.0 - math.exp(-STEP_S / lag))
-    return jnp.maximum(command, a - config.braking_jerk * reach)
 
 
 def _snapshot(case: Case, now: World, after: World, plan: Plan) -> Snapshot:
@@ -190,8 +215,8 @@ def _compiled(
     takeover_policy: Policy | None,
     keep: bool,
 ) -> Callable:
-    def run(params: Params, cases: Case) -> Logs:
-        logs = rollout(policy, params, cases, config, takeover_policy)
+    def run(params: Params, cases: Case, manner: Manner) -> Logs:
+        logs = rollout(policy, params, cases, config, manner, takeover_policy)
         if reduce is None:
             return logs
         record, _ = _unpacked(logs[0], cases, config.snapshots)
@@ -241,12 +266,13 @@ def drive_cases(
     keeps = reduce is not None and (keep or in_groups)
     if keeps:
         config = dataclasses.replace(config, snapshots=True)
+    manner, config = config.split()
     drive = _compiled(policy, reduce, config, takeover_policy, keeps)
 
     def group(first: int) -> Logs:
         lanes = slice(first, first + (LANES if in_groups else total))
         part = jax.tree.map(lambda leaf: leaf[lanes], cases)
-        made = jax.block_until_ready(drive(params, part))
+        made = jax.block_until_ready(drive(params, part, manner))
         # time comes first in the program: a view, where a program would copy
         by_case = lambda x: np.swapaxes(np.asarray(x), 0, 1)  # noqa: E731
 

@@ -39,6 +39,7 @@ import jax.numpy as jnp
 from rcirl_jax.geometry.boxes import Box, contact_interval, frenet_extent, separation
 from rcirl_jax.geometry.frenet import lookup, path_curvature
 from rcirl_jax.geometry.limits import planning_limit
+from rcirl_jax.planner.plan import either
 from rcirl_jax.planner.prediction import Bodies, obstacles_of
 from rcirl_jax.simulation.agents import (
     CORRIDOR_MARGIN_M,
@@ -526,7 +527,7 @@ def step(
     acceleration: jax.Array,
     fallback: jax.Array,
     vehicle: Vehicle,
-    follow_log: bool = False,
+    follow_log: jax.Array | bool = False,
 ) -> tuple[World, Record]:
     """One tick of 0.1 s.
 
@@ -536,25 +537,24 @@ def step(
       acceleration: m/s^2, the ego's command.
       fallback: bool, of the plan in force (only logged).
       vehicle: the ego's limits and lags.
-      follow_log: static; the ego is the recorded human.
+      follow_log: bool, the ego is the recorded human, where there is one.
 
     Returns:
       The world one step later and the record of that later moment.
     """
     ego = world.ego
-    if follow_log and case.replay is not None:
-        moved_ego = _human(case.replay, ego, world.step + 1)
-    else:
-        moved_ego = drive(ego, case.road, acceleration, vehicle)
+    moved_ego = drive(ego, case.road, acceleration, vehicle)
+    if case.replay is not None:
+        human = _human(case.replay, ego, world.step + 1)
+        moved_ego = either(follow_log, human, moved_ego)
     state, induced = _advance_agents(case, world)
     if case.replay is not None:
         logged = _from_log(case, case.replay, world.agents, world.step + 1)
-        keep = world.reactive
-        state = jax.tree.map(lambda a, b: jnp.where(keep, a, b), state, logged)
-        induced = jnp.where(keep, induced, 0.0)
+        state = either(world.reactive, state, logged)
+        induced = jnp.where(world.reactive, induced, 0.0)
     # what has ended stays as it is
     over = world.stopped
-    moved_ego = jax.tree.map(lambda a, b: jnp.where(over, a, b), ego, moved_ego)
+    moved_ego = either(over, ego, moved_ego)
     found = contacts(case, moved_ego, state)
     crossed_red, crossed_sign, served, halts = _lines(case, world, moved_ego)
     crash = jnp.any(found.at_fault)
@@ -572,9 +572,11 @@ def step(
     if case.replay is None:
         state = spawn_and_despawn(case, moved_ego, state, world.step + 1)
     reactive = world.reactive
-    if case.replay is not None and not follow_log:
+    if case.replay is not None:
         ttc = jnp.min(jnp.where(found.ahead, found.ttc, jnp.inf))
-        reactive = _turns_reactive(case, case.replay, world, ttc)
+        reactive = _turns_reactive(case, case.replay, world, ttc) & ~jnp.asarray(
+            follow_log
+        )
     return World(
         step=world.step + 1,
         ego=moved_ego,

@@ -28,6 +28,7 @@ from rcirl_jax.export.reader import PriorCost
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.planner.prediction import with_predicted_futures
 from rcirl_jax.reward.familiarity import (
+    UNITS,
     Familiarity,
     familiarity_logit,
     of_the_scene,
@@ -40,7 +41,6 @@ from rcirl_jax.types import Candidates, Scene
 from rcirl_jax.units import TIMES_S
 
 OWN_COST = "hand-set"  # what stands for the planner's own cost here
-UNITS = 16  # H
 STEPS = 1500
 STEP_SIZE = 1e-2
 DECAY = 1e-3

@@ -14,18 +14,17 @@ from rcirl_jax.evaluation.closed_loop.suite import (
     write_suite,
 )
 from rcirl_jax.evaluation.closed_loop.summary import summarise
-from rcirl_jax.planner.baselines import Idm
-from rcirl_jax.planner.rank import constant_speed_policy, idm_policy
+from rcirl_jax.planner.baselines import Idm, Yielding
 from rcirl_jax.simulation.metrics import COLUMNS
-from rcirl_jax.simulation.rows import Row
+from rcirl_jax.simulation.rows import rule_row
 from rcirl_jax.simulation.suite import catalogue_set, suite_refs
 from tests.report.tuning_case import metrics
 
 FAMILIES = "free_cruise,stopped_lead"
 ROWS = [
-    Row(name="careful", policy=idm_policy(Idm(headway=2.5, standstill_gap=5.0))),
-    Row(name="IDM", policy=idm_policy(Idm())),
-    Row(name="constant speed", policy=constant_speed_policy),
+    rule_row("careful", "IDM", Yielding(idm=Idm(headway=2.5, standstill_gap=5.0))),
+    rule_row("IDM", "IDM"),
+    rule_row("constant speed", "constant speed"),
 ]
 
 

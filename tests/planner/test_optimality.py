@@ -14,11 +14,11 @@ from experiments.paper.plans import (
     steadiness,
     summary,
 )
+from rcirl_jax.planner.baselines import rule, rule_policy
 from rcirl_jax.planner.dp import emergency_stop, optimality_gap
 from rcirl_jax.planner.rank import (
     ONLINE,
     RankConfig,
-    constant_speed_policy,
     rank_policy,
 )
 from rcirl_jax.sampling.kinematics import trajectory_on_path
@@ -83,7 +83,9 @@ def test_disturbances_move_bodies_and_nothing_else():
 
 def test_who_does_not_look_is_steady():
     scenes = batch([random_scene(i) for i in range(3)])
-    found = steadiness(constant_speed_policy, None, scenes, Disturbance(samples=8))
+    found = steadiness(
+        rule_policy, rule("constant speed"), scenes, Disturbance(samples=8)
+    )
     np.testing.assert_allclose(found["acceleration_std"], 0.0, atol=1e-6)
     ego = 8.0 * Disturbance().sigma_ego
     assert (found["end_station_std"] < 3.0 * ego).all()

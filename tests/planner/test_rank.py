@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.baselines import Idm, idm_acceleration
+from rcirl_jax.planner.baselines import Idm, idm_acceleration, rule, rule_policy
 from rcirl_jax.planner.plan import (
     ACTUATOR_LAG_S,
     COMMAND_STEP_S,
@@ -22,7 +22,6 @@ from rcirl_jax.planner.rank import (
     ONLINE,
     RankConfig,
     constant_score,
-    idm_policy,
     learned_score,
     rank_policy,
     velocity_score,
@@ -146,7 +145,7 @@ def test_a_plan_that_rests_within_the_first_interval_is_braked_to_rest():
 
 def test_idm_policy_is_the_formula():
     made = with_obstacle(Kind.VEHICLE, 30.0, 0.0, v=12.0, speed=8.0)
-    plan = idm_policy(Idm())(None, made, jax.random.key(0))
+    plan = rule_policy(rule("IDM"), made, jax.random.key(0))
     gap = 28.0 - 0.5 * float(made.ego.length)
     f = jnp.float32
     expected = idm_acceleration(f(12.0), f(gap), f(4.0), f(30.0), Idm())

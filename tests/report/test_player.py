@@ -70,7 +70,7 @@ def test_the_drives_are_those_of_the_suite():
     cases, row = small_cases(), cheap_rows()[0]
     config = rollout_config(row, cases.duration_s, 1)
     suite = drive_row(row, cases.build, len(cases.ids), config, chunk=60)
-    kept = dataclasses.replace(config, snapshots=True)
+    _, kept = dataclasses.replace(config, snapshots=True).split()
     program = rollout._compiled(row.policy, suite_module._reduced, kept, None, True)
     assert program._cache_size() == 1
     at = cases.ids.index(PLAYED[0])

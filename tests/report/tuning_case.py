@@ -13,11 +13,9 @@ from rcirl_jax.evaluation.gate.verdict import judge
 from rcirl_jax.evaluation.ranking.metrics import Outcomes, random_scorer, scene_metrics
 from rcirl_jax.evaluation.ranking.report import build_report
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.planner.baselines import Idm
-from rcirl_jax.planner.rank import constant_speed_policy, idm_policy
 from rcirl_jax.report.tuning_page import TuningReport
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
-from rcirl_jax.simulation.rows import Row
+from rcirl_jax.simulation.rows import rule_row
 from rcirl_jax.simulation.suite import catalogue_set, suite_refs
 from tests.data.small_logs import CONFIG, write_logs
 from tests.helpers.stored import sweep_result
@@ -26,7 +24,6 @@ from tests.helpers.weights_files import random_weights
 FAMILIES, EACH = ("stop_and_go", "cut_in", "red_light"), 40
 PLAYED = ("stop_and_go/001@0", "red_light/000@0")
 SECONDS = 5.0
-IDM = Idm()
 
 
 def metrics(seed, spoiled=None):
@@ -112,8 +109,7 @@ def small_report(folder, replays):
 
 def cheap_rows():
     """Rows that compile fast; the candidate drives blindly on and crashes."""
-    candidate = Row(name="candidate", policy=constant_speed_policy)
-    return [candidate, Row(name="hand-set", policy=idm_policy(IDM))]
+    return [rule_row("candidate", "constant speed"), rule_row("hand-set", "IDM")]
 
 
 def small_cases():

@@ -6,10 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rcirl_jax.planner.baselines import B_MAX, B_MIN, cc_braking, fsm_braking
 from rcirl_jax.simulation.rows import (
-    Careful,
-    cc_braking,
-    fsm_braking,
     judges,
     preventable,
     trivial,
@@ -18,24 +16,22 @@ from rcirl_jax.types import Kind
 from tests.simulation.drives import drive
 from tests.simulation.worlds import make_case
 
-C = Careful()
-
 
 def test_cc_brakes_at_two_seconds():
     v, lead = jnp.float32(20.0), jnp.float32(10.0)
-    assert cc_braking(jnp.float32(20.1), v, lead, C) == 0.0
-    assert cc_braking(jnp.float32(19.9), v, lead, C) == pytest.approx(7.59)
-    assert cc_braking(jnp.float32(5.0), v, jnp.float32(21.0), C) == 0.0
+    assert cc_braking(jnp.float32(20.1), v, 0.0, lead) == 0.0
+    assert cc_braking(jnp.float32(19.9), v, 0.0, lead) == pytest.approx(7.59)
+    assert cc_braking(jnp.float32(5.0), v, 0.0, jnp.float32(21.0)) == 0.0
 
 
 def test_fsm_grows_as_the_gap_shrinks():
     gaps = jnp.linspace(120.0, 1.0, 60)
     v, lead, a = jnp.float32(20.0), jnp.float32(0.0), jnp.float32(5.0)
-    brakes = np.array([fsm_braking(g, v, lead, a, C) for g in gaps])
+    brakes = np.array([fsm_braking(g, v, lead, a) for g in gaps])
     assert brakes[0] == 0.0
     assert (np.diff(brakes) >= -1e-5).all()
-    assert brakes[-1] == pytest.approx(C.b_max)
-    proactive = brakes[(brakes > 0.0) & (brakes <= C.b_min)]
+    assert brakes[-1] == pytest.approx(B_MAX)
+    proactive = brakes[(brakes > 0.0) & (brakes <= B_MIN)]
     assert proactive.size > 0  # it brakes before the conflict is critical
 
 
@@ -48,7 +44,7 @@ def test_what_can_be_seen_is_avoided_by_both_and_a_sudden_wall_by_neither(
     case = make_case([{"v": 0.0, "kind": Kind.STATIC, **wall}], speed=15.0)
     for row in judges()[:2]:
         how = {"command_delay": row.command_delay, "braking_jerk": row.braking_jerk}
-        record, _ = drive([case], policy=row.policy, params=None, **how)
+        record, _ = drive([case], policy=row.policy, params=row.params, **how)
         assert (record.collision.sum() > 0) == crashes
         assert crashes or record.v[0, -1] < 0.1
 

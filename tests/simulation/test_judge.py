@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rcirl_jax.geometry.boxes import Box, contact_interval
-from rcirl_jax.planner.baselines import Idm
-from rcirl_jax.planner.rank import idm_policy
+from rcirl_jax.planner.baselines import rule, rule_policy
 from rcirl_jax.simulation.agents import spawn_and_despawn, stopping_for_light
 from rcirl_jax.simulation.world import contacts, off_road, start
 from rcirl_jax.types import Kind
@@ -159,7 +158,7 @@ def test_a_served_stop_sign_is_not_run():
     """Brake to rest 2 m before the line, then go."""
     sign = {"kind": 2, "s": 60.0}
     case = make_case(lines=[sign], speed=10.0)
-    record, _ = drive([case], steps=400, policy=idm_policy(Idm()), params=None)
+    record, _ = drive([case], steps=400, policy=rule_policy, params=rule("IDM"))
     assert record.v[0].min() < 0.1
     assert record.s[0, -1] > 70.0
     assert not record.stop_sign[0].any()

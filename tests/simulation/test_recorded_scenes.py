@@ -13,10 +13,8 @@ from rcirl_jax.evaluation.closed_loop.likeness import (
     write_arrays,
 )
 from rcirl_jax.evaluation.gate.types import Likeness
-from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.plan import held
 from rcirl_jax.planner.prediction import with_predicted_futures
-from rcirl_jax.planner.rank import idm_policy
 from rcirl_jax.simulation.recorded import (
     CLOCK_S,
     STEPS,
@@ -25,7 +23,7 @@ from rcirl_jax.simulation.recorded import (
     held_out,
 )
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
-from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row
+from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, rule_row
 from rcirl_jax.simulation.suite import recorded_set
 from rcirl_jax.types import Kind
 from tests.simulation.stored import Rows, stored
@@ -165,7 +163,7 @@ def test_distances_are_those_of_the_drives(tmp_path):
         held_out_likeness(held_out([Rows(stored(3))], 3), [])
     two = stored(3).replace(vehicle=np.array([0, 1, 1], np.int32))
     drives = held_out([Rows(two)], 3)
-    rows = [Row(name="coast", policy=coast), Row(name="IDM", policy=idm_policy(Idm()))]
+    rows = [Row(name="coast", policy=coast), rule_row("IDM", "IDM")]
     report = held_out_likeness(drives, rows)
     coasted = report.rows["coast"]
     apart = lambda t: 0.1 * t**2 - 0.04 * t  # noqa: E731

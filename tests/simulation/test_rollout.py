@@ -1,5 +1,7 @@
 """The closed loop: reproducible, independent of batches, padded, seeded."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,19 +9,26 @@ import pytest
 
 from benchmarks.common import untrained
 from rcirl_jax.errors import InputError
-from rcirl_jax.planner.baselines import Idm
-from rcirl_jax.planner.rank import RankConfig, idm_policy
+from rcirl_jax.planner.baselines import CAREFUL
+from rcirl_jax.planner.rank import RankConfig, ranking
+from rcirl_jax.runtime.compiling import compiles
 from rcirl_jax.simulation.cases import NUM_AGENTS, STEP_S, Replay
 from rcirl_jax.simulation.metrics import MetricsConfig, case_metrics
 from rcirl_jax.simulation.rollout import LANES, RolloutConfig, drive_cases
-from rcirl_jax.simulation.rows import Row, baseline_row
+from rcirl_jax.simulation.rows import (
+    BASELINES,
+    baseline_row,
+    judges,
+    learned_row,
+    rule_row,
+)
 from rcirl_jax.simulation.suite import build, drive_row, suite_refs
 from rcirl_jax.units import TIMES_S
 from tests.simulation.drives import constant, drive, stack
 from tests.simulation.worlds import make_case
 
 CONFIG = RolloutConfig(steps=100)
-IDM = Row(name="IDM", policy=idm_policy(Idm()))
+IDM = rule_row("IDM", "IDM")
 
 
 def metrics_of(row, chunk, seconds=10.0, order=slice(None)):
@@ -39,9 +48,27 @@ def test_batch_size_and_repetition_change_no_bit():
         assert is_same(first, metrics_of(IDM, chunk)), chunk
 
 
+def test_a_table_is_two_programs():
+    """One for whatever ranks candidates, one for all driver models and the judges."""
+    weights, config = untrained(), RankConfig()
+    learned = learned_row("learned", weights, "paper21", "tanh", config)
+    gained = dataclasses.replace(
+        learned, params=ranking(weights, "hand-set", (0.3, 2.0))
+    )
+    rows = [learned, gained, *judges(), rule_row("slow", "IDM", CAREFUL)]
+    rows += [baseline_row(name, "paper21", weights, config) for name in BASELINES]
+    with compiles("jit(run)") as made:
+        found = [metrics_of(row, LANES, 4.0, slice(3)) for row in rows]
+    assert len(made) <= 2
+    assert len({row.policy for row in rows}) == 2
+    # each drives by its own numbers
+    ways = {tuple(one.progress.tolist()) for one in found}
+    assert len(ways) >= 8
+
+
 @pytest.mark.parametrize("name", ["hand-set", "random weights"])
 def test_batch_size_changes_no_bit_of_what_ranks_candidates(name):
-    row = baseline_row(name, "paper21", untrained()[1], RankConfig())
+    row = baseline_row(name, "paper21", untrained(), RankConfig())
     first = metrics_of(row, 2 * LANES, 2.0)
     assert np.unique(first.progress).size > 2
     assert is_same(first, metrics_of(row, LANES, 2.0))

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.common import untrained
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.own_planner.builder import scene_from
-from rcirl_jax.features import feature_map
 from rcirl_jax.planner.plan import held
 from rcirl_jax.planner.rank import RankConfig
 from rcirl_jax.simulation.rows import Row, baseline_row
@@ -30,8 +30,7 @@ def braking(params, scene, key, before=None):
 
 
 def hand_set():
-    count = feature_map("paper21").num_features
-    return baseline_row("hand-set", "paper21", count, RankConfig())
+    return baseline_row("hand-set", "paper21", untrained(), RankConfig())
 
 
 BRAKES = Row(name="brakes", policy=braking)

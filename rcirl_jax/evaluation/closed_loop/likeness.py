@@ -41,7 +41,7 @@ from rcirl_jax.runtime.executors import two_at_a_time
 from rcirl_jax.simulation.cases import STEP_S, Record
 from rcirl_jax.simulation.recorded import STEPS, HeldOut
 from rcirl_jax.simulation.rollout import LANES, drive_cases
-from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, human_row
+from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, firsts_first, human_row
 from rcirl_jax.simulation.suite import rollout_config
 from rcirl_jax.units import HORIZON_S
 
@@ -255,10 +255,11 @@ def held_out_likeness(
             bar.update()
             return found
 
-        made = two_at_a_time(driven, every)
-    found = {row.name: one for row, one in zip(every, made, strict=True)}
+        order = firsts_first(every)
+        made = two_at_a_time(driven, order)
+    found = dict(zip([row.name for row in order], made, strict=True))
     return LikenessReport(
-        rows=found,
+        rows={row.name: found[row.name] for row in every},
         ids=drives.ids,
         clusters=np.unique(drives.vehicle, return_inverse=True)[1],
         recordings=int(np.unique(drives.recording).size),

@@ -23,7 +23,14 @@ from rcirl_jax.runtime.compiling import CompilesFirst
 from rcirl_jax.runtime.executors import two_at_a_time
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.metrics import CaseMetrics
-from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, judges, preventable, trivial
+from rcirl_jax.simulation.rows import (
+    RECORDED_HUMAN,
+    Row,
+    firsts_first,
+    judges,
+    preventable,
+    trivial,
+)
 from rcirl_jax.simulation.suite import CaseSet, drive_row, rollout_config
 
 # s of driving in all cases below which compiling takes longer than driving: then rows
@@ -113,7 +120,7 @@ def run_suite(
     preventable and how far one gets. Where the recorded human is a row, its
     distance is the reference instead of IDM's.
     """
-    every = [*{row.name: row for row in [*rows, *judges()]}.values()]
+    every = firsts_first([*{row.name: row for row in [*rows, *judges()]}.values()])
 
     def one(row: Row) -> tuple[CaseMetrics, float]:
         begin = time.perf_counter()
