@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -98,6 +99,24 @@ def between_bounds(
     half = np.maximum(0.5 * np.hypot(*(left - right).T), MIN_HALF_WIDTH_M)
     keep = moves(centre)
     return centre[keep], half[keep]
+
+
+def lane_between(
+    name: str,
+    bounds: tuple[np.ndarray, np.ndarray],
+    **known: Any,  # noqa: ANN401
+) -> Lane:
+    """Makes a lane midway between two bounds whose points face each other.
+
+    Args:
+      name: its id.
+      bounds: [m, 2] m, left and right, in driving direction.
+      known: other fields of the lane.
+    """
+    left, right = bounds
+    half = np.maximum(0.5 * np.hypot(*(left - right).T), MIN_HALF_WIDTH_M)
+    centre = 0.5 * (left + right)
+    return Lane(id=name, centre=centre, left_width=half, right_width=half, **known)
 
 
 def distances_to_lines(

@@ -1,12 +1,12 @@
 """XML from untrusted files: no entities, no DTD, bounded size.
 
-Numbers out of its elements come with errors that name file and field.
+A `Node` is an element that knows its place, so that what it lacks is one clear line.
 """
 
+import math
 from pathlib import Path
+from typing import cast
 from xml.etree.ElementTree import Element, ParseError
-
-import numpy as np
 
 from rcirl_jax.data.readers.tables.streams import refuse_pointer
 from rcirl_jax.errors import InputError
@@ -32,7 +32,7 @@ def read_xml(path: Path, tag: str, max_bytes: int) -> Element:
     if size > max_bytes:
         raise InputError(f"{path}: size: {size} bytes: expected at most {max_bytes}")
     try:
-        root = Safe.parse(path, forbid_dtd=True).getroot()
+        root = cast(Element, Safe.parse(path, forbid_dtd=True).getroot())
     except DefusedXmlException as error:
         kind = type(error).__name__
         raise InputError(
@@ -40,50 +40,70 @@ def read_xml(path: Path, tag: str, max_bytes: int) -> Element:
         ) from error
     except (ParseError, ValueError, LookupError) as error:
         raise InputError(f"{path}: xml: {error}: expected well-formed XML") from error
-    if root is None or root.tag != tag:
-        found = "nothing" if root is None else str(root.tag)[:40]
-        raise InputError(f"{path}: root: {found!r}: expected {tag}")
+    if root.tag != tag:
+        raise InputError(f"{path}: root: {root.tag[:40]!r}: expected {tag}")
     return root
 
 
-class Fields:
-    """Reads numbers out of elements; errors name file, element and field."""
+class Node:
+    """An element and its place.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    Args:
+      element: of a file.
+      where: the file and the element's place in it, first in errors.
+    """
 
-    def child(self, parent: Element, tag: str, where: str) -> Element:
+    def __init__(self, element: Element, where: str) -> None:
+        self.element, self.where = element, where
+
+    def error(self, field: str, found: object, expected: str) -> InputError:
+        """Makes the line for something wrong in this element."""
+        return InputError(f"{self.where}: {field}: {found}: expected {expected}")
+
+    def child(self, tag: str) -> "Node":
         """Returns a child element that has to be there."""
-        found = parent.find(tag)
+        found = self.element.find(tag)
         if found is None:
-            raise InputError(f"{self.path}: {where}: {tag}: missing: expected it")
-        return found
+            raise self.error(tag, "missing", "it")
+        return Node(found, f"{self.where}: {tag}")
 
-    def number(self, element: Element, where: str) -> float:
-        """Reads a finite number from an element's text."""
+    def each(self, path: str) -> list["Node"]:
+        """Returns all elements at a path of tags, each with its id in its place."""
+        return [
+            Node(one, f"{self.where}: {one.tag} {one.get('id', '(no id)')}")
+            for one in self.element.iterfind(path)
+        ]
+
+    def text(self, tag: str) -> str:
+        """Returns the text of a child; "" without one."""
+        return (self.element.findtext(tag) or "").strip()
+
+    def number(self, tag: str, default: float | None = None) -> float:
+        """Reads a finite number from the text of a child.
+
+        Args:
+          tag: of the child.
+          default: where there is none; None: it has to be there.
+        """
+        found = self.element.find(tag)
+        if found is None and default is not None:
+            return default
+        text = "missing" if found is None else found.text or ""
         try:
-            value = float(element.text or "")
+            value = float(text)
         except ValueError:
-            value = float("nan")
-        if not np.isfinite(value):
-            found = (element.text or "").strip()[:40]
-            raise InputError(
-                f"{self.path}: {where}: {element.tag}: '{found}': "
-                "expected a finite number"
-            )
+            value = math.nan
+        if not math.isfinite(value):
+            raise self.error(tag, f"'{text.strip()[:40]}'", "a finite number")
         return value
 
-    def scalar(self, parent: Element, tag: str, where: str) -> float:
+    def scalar(self, tag: str) -> float:
         """Reads <tag><exact> or the middle of <tag><intervalStart>/<intervalEnd>."""
-        node = self.child(parent, tag, where)
-        exact = node.find("exact")
-        if exact is not None:
-            return self.number(exact, f"{where}: {tag}")
-        low = self.child(node, "intervalStart", f"{where}: {tag}")
-        high = self.child(node, "intervalEnd", f"{where}: {tag}")
-        return 0.5 * (self.number(low, where) + self.number(high, where))
+        node = self.child(tag)
+        if node.element.find("exact") is not None:
+            return node.number("exact")
+        return 0.5 * (node.number("intervalStart") + node.number("intervalEnd"))
 
-    def point(self, parent: Element, where: str) -> tuple[float, float]:
-        """Reads <x>, <y> of a point-like element."""
-        x = self.number(self.child(parent, "x", where), where)
-        return x, self.number(self.child(parent, "y", where), where)
+    def point(self) -> tuple[float, float]:
+        """Reads <x>, <y>."""
+        return self.number("x"), self.number("y")

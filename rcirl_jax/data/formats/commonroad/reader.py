@@ -8,9 +8,8 @@ removed that car from the traffic).
 
 import csv
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -19,10 +18,10 @@ from rcirl_jax.data.formats.files import files_below, log_name
 from rcirl_jax.data.formats.options import is_file_name, one_pattern
 from rcirl_jax.data.formats.shapes import arc_length
 from rcirl_jax.data.formats.tracks import of_one_name
-from rcirl_jax.data.readers.xml import Fields, read_xml
+from rcirl_jax.data.readers.xml import Node, read_xml
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, MissingAgent, Recording, Signal, Track
+from rcirl_jax.types import Kind, Lane, MissingAgent, Recording, Signal, Track
 
 VERSIONS = ("2018b", "2020a")
 GROUPS_UP = 4  # folders above a file in which the table of groups is looked for
@@ -46,6 +45,7 @@ COLOURS = {
 MAX_DURATION = 1e9  # steps of one phase; sums of phases stay exact
 MAX_GOAL_M = 1e5  # m, all lanelets of one goal together
 MAX_INTERVALS = 5_000_000  # of all lights; 100 lights over a day take a tenth of it
+OBSTACLES = ("obstacle", "dynamicObstacle", "staticObstacle")  # the first in 2018b
 # obstacle types; any other type that moves is a vehicle
 KINDS = {
     "bicycle": Kind.CYCLIST,
@@ -92,116 +92,105 @@ def _read_groups(path: Path, name: str) -> dict[str, str]:
     if name and not is_file_name(name):
         raise InputError(f"source TOML: groups: {name}: expected a file name")
     folder = (path if path.is_dir() else path.parent).resolve()
-    for place in (folder, *folder.parents[:GROUPS_UP]):
-        table = place / name
-        if not (name and table.is_file()):
-            continue
-        try:
-            with table.open(newline="", encoding="utf-8-sig") as handle:
-                reader = csv.DictReader(handle)
-                rows, header = list(reader), list(reader.fieldnames or [])
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise InputError(f"{table}: {error}: expected a CSV") from error
-        if not {"file", "group"} <= set(header):
-            raise InputError(f"{table}: columns: {header}: expected file,group")
-        for number, row in enumerate(rows, 1):
-            if row["group"] is None:
-                raise InputError(f"{table}: row {number}: expected file,group")
-        return {row["file"]: row["group"] for row in rows}
-    return {}
+    places = [place / name for place in (folder, *folder.parents[:GROUPS_UP])]
+    table = next((place for place in places if name and place.is_file()), None)
+    if table is None:
+        return {}
+    try:
+        with table.open(newline="", encoding="utf-8-sig") as handle:
+            rows = list(csv.DictReader(handle))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{table}: {error}: expected a CSV") from error
+    found = [(row.get("file"), row.get("group")) for row in rows]
+    for number, pair in enumerate(found, 1):
+        if None in pair:
+            raise InputError(f"{table}: row {number}: {pair}: expected file,group")
+    return {str(file): str(group) for file, group in found}
 
 
 def _read_file(path: Path, spec: dict, groups: dict[str, str]) -> Recording:
-    root, fields = read_xml(path, "commonRoad", MAX_FILE_BYTES), Fields(path)
-    version = root.get("commonRoadVersion", "none")
+    root = Node(read_xml(path, "commonRoad", MAX_FILE_BYTES), str(path))
+    about = root.element.attrib
+    version, step = about.get("commonRoadVersion"), about.get("timeStepSize", "missing")
     if version not in VERSIONS:
-        raise InputError(
-            f"{path}: commonRoadVersion: {version}: expected one of {VERSIONS}"
-        )
-    text = root.get("timeStepSize", "missing")
+        raise root.error("commonRoadVersion", version, f"one of {VERSIONS}")
     try:
-        dt = float(text)
+        dt = float(step)
     except ValueError:
         dt = -1.0
     if not 0.001 <= dt <= 1.0:
-        raise InputError(f"{path}: timeStepSize: {text}: expected 0.001 to 1 s")
-    tracks, notes = _read_tracks(root, fields, dt)
+        raise root.error("timeStepSize", step, "0.001 to 1 s")
+    tracks, notes = _read_tracks(root, dt)
     last = max((float(track.t[-1]) for track in tracks), default=0.0)
-    group = groups.get(path.name)
-    if group is None:
-        group = path.stem
-        notes.append("no vehicle-disjoint group given; the file is its own group")
-    lanes, lane_notes = read_lanes(root, fields, spec)
-    centres = {lane.id: lane.centre for lane in lanes}
+    lanes, lane_notes = read_lanes(root, spec)
     limits = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
     usual = float(spec.get("default_speed_limit", DEFAULT_LIMIT_MPS))
     # source and licence by the file's own source attribute
-    source, licence = root.get("source", "CommonRoad"), spec.get("licence", "unknown")
-    for rule in spec.get("provenance", []):
-        if rule.get("match", "") in source:
-            licence = rule.get("licence", "unknown")
-            source = f"{source}: {rule['source']}" if "source" in rule else source
-            break
+    source = about.get("source", "CommonRoad")
+    rules = [r for r in spec.get("provenance", []) if r.get("match", "") in source]
+    rule = rules[0] if rules else {"licence": spec.get("licence", "unknown")}
+    source = f"{source}: {rule['source']}" if "source" in rule else source
+    group = groups.get(path.name)
+    if group is None:
+        notes.append("no vehicle-disjoint group given; the file is its own group")
     return Recording(
         name=log_name(path, spec, own_name(path)),
         source=f"{source} (CommonRoad {version})",
-        licence=licence,
+        licence=rule.get("licence", "unknown"),
         rate_hz=1.0 / dt,
         tracks=tuple(tracks),
         lanes=lanes,
-        signals=tuple(_signals(root, fields, dt, last)),
-        missing_agents=tuple(_missing_agents(root, fields, dt, centres)),
-        group=group,
+        signals=tuple(_signals(root, dt, last)),
+        missing_agents=tuple(_missing_agents(root, dt, lanes)),
+        group=path.stem if group is None else group,
         # of lanes without one: the median of the file's, if any
         default_speed_limit=float(np.median(limits)) if limits else usual,
         notes=tuple(notes + lane_notes),
     )
 
 
-def _is_standing(element: Element, fields: Fields) -> bool | None:
-    """Whether an obstacle element stands for ever; None for other elements."""
-    if element.tag == "obstacle":
-        role = (element.findtext("role") or "none").strip()
-        if role not in ("dynamic", "static"):
-            raise InputError(
-                f"{fields.path}: obstacle {element.get('id')}: role: {role}: "
-                "expected dynamic or static"
-            )
-    elif element.tag in ("dynamicObstacle", "staticObstacle"):
-        role = element.tag.removesuffix("Obstacle")
-    else:
-        return None
-    kind = (element.findtext("type") or "").strip().lower()
-    return role == "static" or KINDS.get(kind) == Kind.STATIC
+# --------------------------------------------------------------------- tracks
 
 
-def _read_tracks(
-    root: Element, fields: Fields, dt: float
-) -> tuple[list[Track], list[str]]:
+def _read_tracks(root: Node, dt: float) -> tuple[list[Track], list[str]]:
     tracks, standing, unrecorded, doubled = [], [], 0, 0
-    for element in root:
-        stands = _is_standing(element, fields)
-        if stands:
-            standing.append(element)
-        elif stands is False and element.find("trajectory") is not None:
-            track, again = _read_moving(element, fields, dt)
-            tracks.append(track)
-            doubled += again
-        elif stands is False:
+    for element in root.element:
+        if element.tag not in OBSTACLES:
+            continue
+        node = Node(element, f"{root.where}: obstacle {element.get('id')}")
+        role = element.tag.removesuffix("Obstacle")
+        role = node.text("role") if role == "obstacle" else role
+        if role not in ("dynamic", "static"):
+            raise node.error("role", role, "dynamic or static")
+        kind = KINDS.get(node.text("type").lower(), Kind.VEHICLE)
+        if role == "static" or kind == Kind.STATIC:
+            standing.append(node)
+        elif element.find("trajectory") is None:
             unrecorded += 1
+        else:
+            states = [node.child("initialState"), *node.each("trajectory/state")]
+            rows = np.array([_read_state(state, node.where, dt) for state in states])
+            step = np.diff(rows[:, 0], prepend=-np.inf)
+            if (step < 0.0).any():
+                found = f"{rows[np.argmax(step < 0.0), 0] / dt:g}"
+                raise node.error("time", found, "increasing steps")
+            doubled += int(np.sum(step == 0.0))  # the first of a step counts
+            tracks.append(_track(node, kind, [*rows[step > 0.0].T.copy()]))
     first = min((float(track.t[0]) for track in tracks), default=0.0)
     last = max((float(track.t[-1]) for track in tracks), default=0.0)
     clock = np.arange(round(first / dt), round(last / dt) + 1) * dt
     if len(standing) * clock.size > MAX_STANDING:
-        raise InputError(
-            f"{fields.path}: obstacles: {len(standing)} static ones over {clock.size} "
-            f"steps: expected up to {MAX_STANDING} samples"
-        )
-    tracks += [_read_standing(element, fields, clock) for element in standing]
+        found = f"{len(standing)} static ones over {clock.size} steps"
+        raise root.error("obstacles", found, f"up to {MAX_STANDING} samples")
+    for node in standing:
+        state = node.child("initialState")
+        still = (*_position(state), state.scalar("orientation"), 0.0)
+        series = [clock, *(np.full(clock.shape, value) for value in still)]
+        tracks.append(_track(node, Kind.STATIC, series))
     tracks, notes = of_one_name(tracks)
     if doubled:
         notes.append(f"{doubled} states of a step met twice, one used")
-    states = (state for tag in ("initialState", "state") for state in root.iter(tag))
+    states = (s for tag in ("initialState", "state") for s in root.element.iter(tag))
     places = (state.find("position") for state in states)
     regions = sum(place is not None and place.find("point") is None for place in places)
     if regions:
@@ -211,54 +200,22 @@ def _read_tracks(
     return tracks, notes
 
 
-def _read_moving(element: Element, fields: Fields, dt: float) -> tuple[Track, int]:
-    """A track, and how many of its states were left out."""
-    where = f"obstacle {element.get('id')}"
-    states = [fields.child(element, "initialState", where)]
-    states += element.iterfind("trajectory/state")
-    rows = np.array([_read_state(state, fields, where, dt) for state in states])
-    rows = rows[np.append(True, np.diff(rows[:, 0]) != 0.0)]  # the first of a step
-    backwards = np.flatnonzero(np.diff(rows[:, 0]) <= 0.0)
-    if backwards.size:
-        step = rows[backwards[0] + 1, 0] / dt
-        raise InputError(
-            f"{fields.path}: {where}: time: {step:g}: expected increasing steps"
-        )
-    kind = (element.findtext("type") or "unknown").strip().lower()
-    track = _track(element, fields, KINDS.get(kind, Kind.VEHICLE), rows.T.copy())
-    return track, len(states) - len(rows)
-
-
-def _read_state(state: Element, fields: Fields, where: str, dt: float) -> tuple:
-    step = fields.scalar(state, "time", where)
+def _read_state(state: Node, where: str, dt: float) -> tuple[float, ...]:
+    """Time [s], x, y [m], heading [rad], speed [m/s] of an obstacle's state."""
+    step = state.scalar("time")
     if abs(step) > MAX_STEP:
-        raise InputError(
-            f"{fields.path}: {where}: time: {step:g}: expected steps up to {MAX_STEP:g}"
-        )
-    where = f"{where}: state {step:g}"
-    x, y = _position(state, fields, where)
-    heading = fields.scalar(state, "orientation", where)
-    return step * dt, x, y, heading, fields.scalar(state, "velocity", where)
+        raise state.error("time", f"{step:g}", f"steps up to {MAX_STEP:g}")
+    state.where = f"{where}: state {step:g}"
+    x, y = _position(state)
+    return step * dt, x, y, state.scalar("orientation"), state.scalar("velocity")
 
 
-def _read_standing(element: Element, fields: Fields, clock: np.ndarray) -> Track:
-    where = f"obstacle {element.get('id')}"
-    state = fields.child(element, "initialState", where)
-    x, y = _position(state, fields, where)
-    heading = fields.scalar(state, "orientation", where)
-    still = [np.full(clock.shape, value) for value in (x, y, heading, 0.0)]
-    return _track(element, fields, Kind.STATIC, (clock, *still))
-
-
-def _track(element: Element, fields: Fields, kind: Kind, series: Iterable) -> Track:
-    """A track whose positions are those of the box centre."""
-    name = element.get("id")
-    if name is None:
-        raise InputError(f"{fields.path}: {element.tag}: id: missing: expected it")
+def _track(node: Node, kind: Kind, series: Sequence[np.ndarray]) -> Track:
+    """A track whose positions are those of the centre of its shape's box."""
     t, x, y, heading, speed = series
-    length, width, ahead, left, turn = _shape(element, fields, f"obstacle {name}")
+    length, width, ahead, left, turn = _box(node.child("shape"))
     return Track(
-        id=name,
+        id=node.element.get("id", "(no id)"),
         kind=kind,
         length=length,
         width=width,
@@ -270,64 +227,51 @@ def _track(element: Element, fields: Fields, kind: Kind, series: Iterable) -> Tr
     )
 
 
-def _shape(
-    element: Element, fields: Fields, where: str
-) -> tuple[float, float, float, float, float]:
+def _box(shape: Node) -> tuple[float, float, float, float, float]:
     """A shape's box in the obstacle's own frame.
 
     Returns:
       Length and width [m], how far its centre lies ahead and to the left of the
       obstacle's position [m], and its turn against the obstacle's heading [rad].
     """
-    where = f"{where}: shape"
-    shape = fields.child(element, "shape", where)
-    box, circle = shape.find("rectangle"), shape.find("circle")
-    found = circle if box is None else box
-    centre = None if found is None else found.find("center")
-    x, y = (0.0, 0.0) if centre is None else fields.point(centre, where)
-    if box is not None:
-        length = fields.number(fields.child(box, "length", where), where)
-        width = fields.number(fields.child(box, "width", where), where)
-        turn = box.find("orientation")
-        return length, width, x, y, 0.0 if turn is None else fields.number(turn, where)
-    if circle is not None:
-        size = 2.0 * fields.number(fields.child(circle, "radius", where), where)
-        return size, size, x, y, 0.0
-    points = [fields.point(point, where) for point in shape.iterfind("polygon/point")]
+    points = [point.point() for point in shape.each("polygon/point")]
+    kinds = [one.tag for one in shape.element]
+    kind = next((one for one in ("rectangle", "circle") if one in kinds), None)
+    if kind is not None:
+        found = shape.child(kind)
+        has_centre = found.element.find("center") is not None
+        centre = found.child("center").point() if has_centre else (0.0, 0.0)
+        if kind == "circle":
+            size = 2.0 * found.number("radius")
+            return size, size, *centre, 0.0
+        size = found.number("length"), found.number("width")
+        return *size, *centre, found.number("orientation", 0.0)
     if not points:
-        tags = ", ".join(child.tag for child in shape) or "nothing"
         raise InputError(
-            f"{fields.path}: {where}: {tags}: expected rectangle, circle or polygon"
+            f"{shape.where}: {', '.join(kinds) or 'nothing'}: "
+            "expected rectangle, circle or polygon"
         )
     low, high = np.min(points, axis=0), np.max(points, axis=0)
-    length, width = (high - low).tolist()
-    x, y = (0.5 * (high + low)).tolist()
+    (length, width), (x, y) = (high - low).tolist(), (0.5 * (high + low)).tolist()
     return length, width, x, y, 0.0
 
 
-# ----------------------------------------- places, signals and missing agents
-
-
-def _position(state: Element, fields: Fields, where: str) -> tuple[float, float]:
+def _position(state: Node) -> tuple[float, float]:
     """(x, y) m of a state's point, or of the middle of its region."""
-    place = fields.child(state, "position", where)
-    point = place.find("point")
-    if point is None and (middle := _region_middle(place, fields, where)) is not None:
+    place = state.child("position")
+    if place.element.find("point") is None and (middle := _middle(place)) is not None:
         return middle
-    point = fields.child(place, "point", f"{where}: position")
-    return fields.point(point, where)
+    return place.child("point").point()
 
 
-def _region_middle(
-    place: Element, fields: Fields, where: str
-) -> tuple[float, float] | None:
+def _middle(place: Node) -> tuple[float, float] | None:
     """(x, y) m in the middle of the shapes of a position; None without any.
 
     The mean of the centres of rectangles and circles, and of polygons' corners.
     """
-    middles = [fields.point(centre, where) for centre in place.iterfind("*/center")]
-    for polygon in place.iterfind("polygon"):
-        corners = [fields.point(one, where) for one in polygon.iterfind("point")]
+    middles = [centre.point() for centre in place.each("*/center")]
+    for polygon in place.each("polygon"):
+        corners = [corner.point() for corner in polygon.each("point")]
         middles += [np.mean(corners, axis=0)] if corners else []
     if not middles:
         return None
@@ -335,100 +279,88 @@ def _region_middle(
     return x, y
 
 
-def _signals(root: Element, fields: Fields, dt: float, last: float) -> Iterator[Signal]:
+# -------------------------------------------------- signals and missing agents
+
+
+def _signals(root: Node, dt: float, last: float) -> Iterator[Signal]:
     """Every traffic light's written cycle, unrolled from 0 to after `last` s."""
     left = MAX_INTERVALS
-    for light in root.iterfind("trafficLight"):
-        name = light.get("id", "(no id)")
-        where = f"trafficLight {name}"
+    for light in root.each("trafficLight"):
         phases = []
-        for element in light.iterfind("cycle/cycleElement"):
-            colour = (element.findtext("color") or "none").strip()
-            duration = fields.number(fields.child(element, "duration", where), where)
+        for one in light.each("cycle/cycleElement"):
+            colour, duration = one.text("color"), one.number("duration")
             if colour.lower() not in COLOURS or not 1.0 <= duration <= MAX_DURATION:
-                raise InputError(
-                    f"{fields.path}: {where}: cycleElement: {colour} for {duration:g}: "
-                    f"expected a colour of {sorted(COLOURS)} and a duration of 1 to "
-                    f"{MAX_DURATION:g} steps"
+                raise light.error(
+                    "cycleElement",
+                    f"{colour} for {duration:g}",
+                    f"a colour of {sorted(COLOURS)} and a duration of 1 to "
+                    f"{MAX_DURATION:g} steps",
                 )
             phases.append((COLOURS[colour.lower()], duration))
-        if not phases or (light.findtext("active") or "true").strip() == "false":
+        if not phases or light.text("active") == "false":
             phases = [("off", max(last, 1.0) / dt)]
-        offset = light.find("cycle/timeOffset")
-        start = fields.number(offset, where) if offset is not None else 0.0
-        period = sum(duration for _, duration in phases)
-        begin = start % period - period  # steps; at or before 0
+        states, durations = zip(*phases, strict=True)
+        period = sum(durations)
+        # steps; at or before 0
+        begin = light.number("cycle/timeOffset", 0.0) % period - period
         turns = max(int((last / dt - begin) // period) + 1, 1)
         left -= turns * len(phases)
         if left < 0:
-            raise InputError(
-                f"{fields.path}: {where}: cycle: {turns} turns of {len(phases)}: "
-                f"expected up to {MAX_INTERVALS} intervals of all lights"
+            raise light.error(
+                "cycle",
+                f"{turns} turns of {len(phases)}",
+                f"up to {MAX_INTERVALS} intervals of all lights",
             )
-        states, durations = zip(*phases, strict=True)
         ends = np.cumsum(durations)
         within = np.concatenate([[0.0], ends[:-1]])
         steps = begin + np.arange(turns)[:, None] * ends[-1] + within
+        name = light.element.get("id", "(no id)")
         yield Signal(
             id=name, start=steps.ravel() * dt, state=states * turns, is_recorded=False
         )
 
 
 def _missing_agents(
-    root: Element, fields: Fields, dt: float, lanes: dict[str, np.ndarray]
+    root: Node, dt: float, lanes: Sequence[Lane]
 ) -> Iterator[MissingAgent]:
     """Every planning problem's car, which the converter took out of the traffic."""
-    for problem in root.iterfind("planningProblem"):
-        where = f"planningProblem {problem.get('id', '(no id)')}"
-        initial = fields.child(problem, "initialState", where)
-        start = _position(initial, fields, where)
-        t0 = fields.scalar(initial, "time", where) * dt
-        goals = problem.findall("goalState")
-        if not goals:
-            raise InputError(f"{fields.path}: {where}: goalState: missing: expected it")
-        placed = [goal for goal in goals if goal.find("position") is not None]
-        goal = (placed or goals)[0]
-        t1 = max(fields.scalar(goal, "time", where) * dt, t0 + dt)
-        speed = fields.scalar(initial, "velocity", where)
-        heading = fields.scalar(initial, "orientation", where)
+    for problem in root.each("planningProblem"):
+        initial, goals = problem.child("initialState"), problem.each("goalState")
+        start, t0 = _position(initial), initial.scalar("time") * dt
+        placed = [one for one in goals if one.element.find("position") is not None]
+        goal = (placed or goals or [problem.child("goalState")])[0]
+        t1 = max(goal.scalar("time") * dt, t0 + dt)
+        speed, heading = initial.scalar("velocity"), initial.scalar("orientation")
         ahead = speed * (t1 - t0) * np.array([np.cos(heading), np.sin(heading)])
-        end = _goal_point(goal, fields, where, np.array(start) + ahead, lanes)
-        yield MissingAgent(
-            t0=t0, t1=t1, start=start, end=(float(end[0]), float(end[1]))
-        )
+        x, y = _goal_point(goal, np.array(start) + ahead, lanes)
+        yield MissingAgent(t0=t0, t1=t1, start=start, end=(float(x), float(y)))
 
 
 def _goal_point(
-    goal: Element,
-    fields: Fields,
-    where: str,
-    coasted: np.ndarray,
-    lanes: dict[str, np.ndarray],
-) -> np.ndarray:
+    goal: Node, coasted: np.ndarray, lanes: Sequence[Lane]
+) -> Sequence[float]:
     """[2] m, where the missing car is at the goal's time.
 
     A goal shape's centre; inside goal lanelets the centre-line point nearest to
     where the car gets at its initial speed (the lanelet's end would mean up to
     75 m/s in the NGSIM files); without a position, the coasted point itself.
     """
-    place = goal.find("position")
-    middle = None if place is None else _region_middle(place, fields, where)
-    if middle is not None:
-        return np.array(middle)
-    names = [ref.get("ref", "") for ref in goal.iterfind("position/lanelet")]
-    lines = [lanes[name] for name in dict.fromkeys(names) if name in lanes]
-    if not lines:
-        return coasted
-    total = sum(float(np.hypot(*np.diff(line, axis=0).T).sum()) for line in lines)
+    for place in goal.each("position"):
+        if (middle := _middle(place)) is not None:
+            return middle
+    refs = [one.get("ref", "") for one in goal.element.iterfind("position/lanelet")]
+    centres = {lane.id: lane.centre for lane in lanes}
+    lines = [centres[name] for name in dict.fromkeys(refs) if name in centres]
+    arcs = [arc_length(line) for line in lines]
+    total = sum(float(arc[-1]) for arc in arcs)
     if not total <= MAX_GOAL_M:
-        raise InputError(
-            f"{fields.path}: {where}: goalState: lanelets of {total:.0f} m: "
-            f"expected up to {MAX_GOAL_M:.0f} m"
-        )
+        found = f"lanelets of {total:.0f} m"
+        raise goal.error("goalState", found, f"up to {MAX_GOAL_M:.0f} m")
+    if not lines:
+        return coasted.tolist()
     dense = []  # about one point a metre
-    for line in lines:
-        arc = arc_length(line)
+    for line, arc in zip(lines, arcs, strict=True):
         at = np.linspace(0.0, arc[-1], int(arc[-1]) + 2)
         dense.append(np.stack([np.interp(at, arc, line[:, i]) for i in (0, 1)], axis=1))
     near = np.concatenate(dense)
-    return near[np.argmin(np.hypot(*(near - coasted).T))]
+    return near[np.argmin(np.hypot(*(near - coasted).T))].tolist()
