@@ -14,6 +14,7 @@ FAR_M = 1e4  # m; coordinates beyond it are moved to a local origin
 ORIGIN_STEP_M = 1000.0  # m, local origins are multiples of it
 MAX_COORDINATE_M = 1e8  # m, farther than any map projection on Earth reaches
 MIN_HALF_WIDTH_M = 0.1  # m, lanes taper to a point at forks
+MAX_LIMIT_MPS = 60.0  # m/s; faster "limits" are none
 MARGIN_M = 150.0  # m of a map that are read around the tracks
 CHUNK = 100_000  # points whose distances are found at once
 FRACTION_DIGITS = 7  # fractions of a line that differ by less are one
@@ -117,6 +118,13 @@ def lane_between(
     half = np.maximum(0.5 * np.hypot(*(left - right).T), MIN_HALF_WIDTH_M)
     centre = 0.5 * (left + right)
     return Lane(id=name, centre=centre, left_width=half, right_width=half, **known)
+
+
+def limit_of(value: object) -> float | None:
+    """Returns a map's speed limit [m/s]; None where it is no number, 0 or too fast."""
+    if isinstance(value, int | float) and 0.0 < value <= MAX_LIMIT_MPS:
+        return float(value)
+    return None
 
 
 def distances_to_lines(

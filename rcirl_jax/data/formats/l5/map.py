@@ -18,6 +18,7 @@ from rcirl_jax.data.formats.shapes import (
     Roads,
     between_bounds,
     check_coordinates,
+    limit_of,
     moves,
 )
 from rcirl_jax.data.readers.protobuf import Message, parser, table_of
@@ -29,7 +30,6 @@ from rcirl_jax.types import Lane, Signal
 MAX_MAP_BYTES = 32 * 1024**2  # bytes; the public map has some 10 MB
 MAX_META_BYTES = 16 * 1024**2  # bytes of meta.json
 HOLD_S = 1.0  # s, a light unseen keeps its state this long
-MAX_LIMIT_MPS = 60.0  # m/s; faster "limits" are none
 ONLY_BIKE = 4  # AccessRestriction.Type
 BACKWARD = 3  # RoadNetworkSegment.TravelDirection
 # traffic controls that are faces of one colour: round, arrows, U-turn, flashing
@@ -65,11 +65,10 @@ def find_map(folder: Path, spec: dict) -> Path | None:
     """Finds semantic_map.pb as named in the TOML, or beside or above a dataset."""
     name = path_option(spec, "map")
     above = folder.resolve().parents
+    inner = ("semantic_map.pb", "semantic_map/semantic_map.pb")
+    places = [place / file for place in (folder, *above[:2]) for file in inner]
     if name:
         places = [place / name for place in (Path(), folder, *above[:3])]
-    else:
-        inner = ("semantic_map.pb", "semantic_map/semantic_map.pb")
-        places = [place / file for place in (folder, *above[:2]) for file in inner]
     found = next((place for place in places if place.is_file()), None)
     if name and found is None:
         raise InputError(f"source TOML: map: {name}: expected a semantic map")
@@ -219,7 +218,7 @@ class SemanticMap:
             centre=centre,
             left_width=half,
             right_width=half,
-            speed_limit=limit if 0.0 < limit <= MAX_LIMIT_MPS else None,
+            speed_limit=limit_of(limit),
             successors=tuple(other.id for other in lane.ahead),
             left=lane.beside_left.id or None,
             right=lane.beside_right.id or None,
@@ -262,14 +261,12 @@ def world_to_ecef(file: Path, spec: dict) -> np.ndarray:
     Raises:
       InputError: no rigid transform.
     """
-    places = [folder / "meta.json" for folder in file.resolve().parents[:2]]
-    meta = next((place for place in places if place.is_file()), None)
     where, found = "source TOML", spec.get("world_to_ecef")
-    if meta is not None:
+    places = [folder / "meta.json" for folder in file.resolve().parents[:2]]
+    for meta in [place for place in places if place.is_file()][:1]:
         content = checked(read_json(meta, "an object", MAX_META_BYTES), dict, meta)
         known = content.get("world_to_ecef", content.get("pose_to_ecef"))
-        if known is not None:
-            where, found = str(meta), known
+        where, found = (where, found) if known is None else (str(meta), known)
     try:
         matrix = np.array(found, np.float64)
     except (ValueError, TypeError, OverflowError):

@@ -91,28 +91,17 @@ LIMIT_MPS = 15.65  # m/s, 35 mph: main roads of Palo Alto
 EGO = {"length": 4.87, "width": 1.85, "centre_ahead": 0.0}  # m
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Dataset:
-    path: Path
-    scenes: np.ndarray
-    frames: StructuredArray
-    agents: StructuredArray
-    faces: StructuredArray | None
-
-
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """Yields one Recording per scene, of all datasets or of the spec's piece of one."""
     for folder in parts(path, spec):
-        dataset, road, above = _open(folder), _map_of(folder, spec), folder.absolute()
+        dataset, above = _Dataset(folder, spec), folder.absolute()
         home = above.parents[1 if above.parent.name == "scenes" else 0]
         others = [other for other in _datasets(home, spec) if other != above]
         groups = groups_of(dataset.scenes, [*tables_of(others).values()])
         first, last = spec.get(PIECE, (0, len(groups)))
         for index in range(first, last):
             name = f"{folder.stem}-{index:06d}"
-            make = functools.partial(
-                _recording, dataset, name, dataset.scenes[index], road, spec
-            )
+            make = functools.partial(dataset.recording, name, dataset.scenes[index])
             made = accepted(make, name, f"{folder}: scene {index}", spec)
             yield dataclasses.replace(
                 made, group=groups[index], progress=(index + 1) / len(groups)
@@ -208,27 +197,14 @@ def _map_of(folder: Path, spec: dict) -> SemanticMap | None:
     if file is None:
         return None
     about, to_ecef = file.stat(), world_to_ecef(file, spec)
-    return _map(file, about.st_mtime_ns, about.st_size, tuple(to_ecef.flat))
+    return _map(file, (about.st_mtime_ns, about.st_size), tuple(to_ecef.flat))
 
 
-@functools.lru_cache(maxsize=1)  # pieces of a dataset share it
-def _map(file: Path, changed_ns: int, size: int, to_ecef: tuple) -> SemanticMap:
+@functools.lru_cache(maxsize=1)
+def _map(file: Path, as_of: tuple[int, int], to_ecef: tuple) -> SemanticMap:
     """The map of a file as it was; all pieces of a dataset share it."""
-    del changed_ns, size  # they tell files of one name apart
+    del as_of  # tells files of one name apart
     return SemanticMap(file, np.array(to_ecef).reshape(4, 4))
-
-
-def _open(folder: Path) -> _Dataset:
-    frames = StructuredArray(folder / "frames", FRAMES)
-    lights = folder / "traffic_light_faces"  # missing in format version 1
-    has_lights = lights.is_dir() and FACE_INTERVAL in (frames.dtype.names or ())
-    return _Dataset(
-        path=folder,
-        scenes=scenes_of(folder),
-        frames=frames,
-        agents=StructuredArray(folder / "agents", AGENTS),
-        faces=StructuredArray(lights, FACES) if has_lights else None,
-    )
 
 
 def _interval(where: str, bounds: np.ndarray, size: int, most: int) -> tuple[int, int]:
@@ -241,98 +217,112 @@ def _interval(where: str, bounds: np.ndarray, size: int, most: int) -> tuple[int
     return start, stop
 
 
-def _recording(
-    dataset: _Dataset,
-    name: str,
-    scene: np.void,
-    semantic_map: SemanticMap | None,
-    spec: dict,
-) -> Recording:
-    where = f"{dataset.path}: {name}"
-    start, stop = _interval(
-        f"{where}: frame_index_interval",
-        scene["frame_index_interval"],
-        dataset.frames.size,
-        MAX_FRAMES,
-    )
-    if start == stop:
-        raise InputError(
-            f"{where}: frame_index_interval: [{start}, {stop}]: expected frames"
-        )
-    frames = dataset.frames.read(start, stop)
-    t = (frames["timestamp"] - frames["timestamp"][0]).astype(np.float64) * 1e-9
-    rate = positive(spec, "rate_hz", RATE_HZ)
-    step = float(np.median(np.diff(t))) if t.size > 1 else 1.0 / rate
-    if not 0.5 < step * rate < 2.0:
-        raise InputError(
-            f"{where}: timestamp: median step {step:g} s: expected {1.0 / rate:g} s, "
-            "in ns"
-        )
-    ego = _ego(Path(where), frames, t, spec)
-    others, notes = _others(Path(where), dataset, frames, t, spec)
-    tracks = [*ego, *others]
-    x, y, origin, tracks = placed(tracks)
-    lanes, signals, map_notes = (), (), []
-    if semantic_map is not None:
-        lanes = semantic_map.roads.around(x, y, origin)
-        signals, map_notes = _signals(where, dataset, frames, t, semantic_map, lanes)
-    if not lanes:
-        lanes, note = fitted_lanes(tracks, spec)
-        map_notes = [f"no map here; {note}"]
-    return Recording(
-        name=name,
-        source=str(spec.get("source", "L5 prediction dataset")),
-        licence=str(spec.get("licence", "unknown")),
-        rate_hz=rate,
-        tracks=tuple(tracks),
-        lanes=lanes,
-        signals=signals,
-        default_speed_limit=positive(spec, "speed_limit", LIMIT_MPS),
-        notes=(*notes, *origin_notes(origin), *map_notes),
-    )
+class _Dataset:
+    """The arrays of a dataset, and its map; scenes become recordings one by one."""
 
-
-def _ego(path: Path, frames: np.ndarray, t: np.ndarray, spec: dict) -> list[Track]:
-    """The recording car; its speed comes from its positions."""
-    x, y, _ = frames["ego_translation"].astype(np.float64).T
-    check_coordinates(path, "ego_translation", ("x", "y"), np.stack([x, y], axis=1))
-    ahead = frames["ego_rotation"][:, :2, 0].astype(np.float64)  # [n, 2] unit
-    bad = np.flatnonzero(~(np.abs(np.hypot(*ahead.T) - 1.0) < 0.5))
-    if bad.size:
-        raise InputError(
-            f"{path}: frame {bad[0]}: ego_rotation: {ahead[bad[0]]}: "
-            "expected a rotation matrix"
+    def __init__(self, folder: Path, spec: dict) -> None:
+        self.folder, self.spec, self.scenes = folder, spec, scenes_of(folder)
+        self.frames = StructuredArray(folder / "frames", FRAMES)
+        self.agents = StructuredArray(folder / "agents", AGENTS)
+        lights = folder / "traffic_light_faces"  # missing in format version 1
+        has_lights = lights.is_dir() and FACE_INTERVAL in (
+            self.frames.dtype.names or ()
         )
-    heading = np.arctan2(ahead[:, 1], ahead[:, 0])
-    boxes = ego_boxes(spec, EGO, t, x, y, heading, np.full(t.size, np.nan))
-    return tracks_of(path, boxes, MAX_GAP_S, automated=recording_car(spec))[0]
+        self.faces = StructuredArray(lights, FACES) if has_lights else None
+        self.map = _map_of(folder, spec)
 
-
-def _others(
-    path: Path, dataset: _Dataset, frames: np.ndarray, t: np.ndarray, spec: dict
-) -> tuple[list[Track], list[str]]:
-    agents, frame = _records(
-        f"{path}: agent_index_interval", dataset.agents, frames["agent_index_interval"]
-    )
-    labels = agents["label_probabilities"]
-    if not np.isfinite(labels).all():
-        row = int(np.flatnonzero(~np.isfinite(labels).all(axis=1))[0])
-        raise InputError(
-            f"{path}: agent {row}: label_probabilities: not finite: "
-            "expected probabilities"
+    def recording(self, name: str, scene: np.void) -> Recording:
+        """Returns one scene."""
+        spec, where = self.spec, f"{self.folder}: {name}"
+        field, bounds = "frame_index_interval", scene["frame_index_interval"]
+        size = self.frames.size
+        start, stop = _interval(f"{where}: {field}", bounds, size, MAX_FRAMES)
+        if start == stop:
+            raise InputError(f"{where}: {field}: [{start}, {stop}]: expected frames")
+        frames = self.frames.read(start, stop)
+        t = (frames["timestamp"] - frames["timestamp"][0]).astype(np.float64) * 1e-9
+        rate = positive(spec, "rate_hz", RATE_HZ)
+        step = float(np.median(np.diff(t))) if t.size > 1 else 1.0 / rate
+        if not 0.5 < step * rate < 2.0:
+            raise InputError(
+                f"{where}: timestamp: median step {step:g} s: expected {1.0 / rate:g} "
+                "s, in ns"
+            )
+        others, notes = self._others(Path(where), frames, t)
+        x, y, origin, tracks = placed([*self._ego(Path(where), frames, t), *others])
+        lanes, signals, map_notes = (), (), []
+        if self.map is not None:
+            lanes = self.map.roads.around(x, y, origin)
+            signals, map_notes = self._signals(where, frames, t, lanes)
+        if not lanes:
+            lanes, note = fitted_lanes(tracks, spec)
+            map_notes = [f"no map here; {note}"]
+        return Recording(
+            name=name,
+            source=str(spec.get("source", "L5 prediction dataset")),
+            licence=str(spec.get("licence", "unknown")),
+            rate_hz=rate,
+            tracks=tuple(tracks),
+            lanes=lanes,
+            signals=signals,
+            default_speed_limit=positive(spec, "speed_limit", LIMIT_MPS),
+            notes=(*notes, *origin_notes(origin), *map_notes),
         )
-    likely = labels.max(axis=1, initial=0.0) >= number(spec, "min_probability", 0.5)
-    best = labels.argmax(axis=1) if agents.size else np.zeros(0, np.int64)
-    centre = agents["centroid"].astype(np.float64)
-    check_coordinates(path, "centroid", ("x", "y"), centre)
-    track_ids, ids = np.unique(agents["track_id"], return_inverse=True)
-    names = [*map(str, track_ids.tolist())]
-    kinds = np.where(likely, KIND_OF_LABEL[best], UNKNOWN)
-    heading, (x, y) = agents["yaw"].astype(np.float64), centre.T
-    speed = np.hypot(*agents["velocity"].astype(np.float64).T)
-    length, width, _ = agents["extent"].astype(np.float64).T
-    boxes = Boxes(ids, names, t[frame], x, y, heading, speed, length, width, kinds)
-    return tracks_of(path, boxes, MAX_GAP_S, str(spec.get("unknown", "drop")))
+
+    def _ego(self, path: Path, frames: np.ndarray, t: np.ndarray) -> list[Track]:
+        """The recording car; its speed comes from its positions."""
+        x, y, _ = frames["ego_translation"].astype(np.float64).T
+        check_coordinates(path, "ego_translation", ("x", "y"), np.stack([x, y], axis=1))
+        ahead = frames["ego_rotation"][:, :2, 0].astype(np.float64)  # [n, 2] unit
+        bad = np.flatnonzero(~(np.abs(np.hypot(*ahead.T) - 1.0) < 0.5))
+        if bad.size:
+            raise InputError(
+                f"{path}: frame {bad[0]}: ego_rotation: {ahead[bad[0]]}: "
+                "expected a rotation matrix"
+            )
+        heading, speed = np.arctan2(ahead[:, 1], ahead[:, 0]), np.full(t.size, np.nan)
+        boxes = ego_boxes(self.spec, EGO, t, x, y, heading, speed)
+        car = recording_car(self.spec)
+        return tracks_of(path, boxes, MAX_GAP_S, automated=car)[0]
+
+    def _others(
+        self, path: Path, frames: np.ndarray, t: np.ndarray
+    ) -> tuple[list[Track], list[str]]:
+        field = "agent_index_interval"
+        agents, frame = _records(f"{path}: {field}", self.agents, frames[field])
+        labels = agents["label_probabilities"]
+        if not np.isfinite(labels).all():
+            row = int(np.argmin(np.isfinite(labels).all(axis=1)))
+            raise InputError(
+                f"{path}: agent {row}: label_probabilities: not finite: "
+                "expected probabilities"
+            )
+        least = number(self.spec, "min_probability", 0.5)
+        best = labels.argmax(axis=1) if agents.size else np.zeros(0, np.int64)
+        likely = labels.max(axis=1, initial=0.0) >= least
+        kinds = np.where(likely, KIND_OF_LABEL[best], UNKNOWN)
+        centre = agents["centroid"].astype(np.float64)
+        check_coordinates(path, "centroid", ("x", "y"), centre)
+        track_ids, ids = np.unique(agents["track_id"], return_inverse=True)
+        names = [*map(str, track_ids.tolist())]
+        heading, (x, y) = agents["yaw"].astype(np.float64), centre.T
+        speed = np.hypot(*agents["velocity"].astype(np.float64).T)
+        length, width, _ = agents["extent"].astype(np.float64).T
+        boxes = Boxes(ids, names, t[frame], x, y, heading, speed, length, width, kinds)
+        unknown = str(self.spec.get("unknown", "drop"))
+        return tracks_of(path, boxes, MAX_GAP_S, unknown)
+
+    def _signals(
+        self, where: str, frames: np.ndarray, t: np.ndarray, lanes: tuple[Lane, ...]
+    ) -> tuple[tuple[Signal, ...], list[str]]:
+        """Lights of the lanes, from the faces seen in each frame."""
+        if self.map is None or self.faces is None:
+            return (), ["no traffic lights recorded"]
+        intervals = frames[FACE_INTERVAL]
+        faces, frame = _records(f"{where}: {FACE_INTERVAL}", self.faces, intervals)
+        status = faces["traffic_light_face_status"]
+        lit = status.argmax(axis=1) == 0 if faces.size else np.zeros(0, bool)
+        return self.map.signals(lanes, t, frame, faces["face_id"], lit), []
 
 
 def _records(
@@ -344,12 +334,12 @@ def _records(
     others (subsets of frames) are read in one piece and picked.
     """
     counts = (intervals[:, 1] - intervals[:, 0]).astype(np.int64)
-    first, last = int(intervals[:, 0].min()), int(intervals[:, 1].max())
     bad = np.flatnonzero((counts < 0) | (counts > MAX_AGENTS))
-    row = int(bad[0]) if bad.size else 0
     if bad.size:
-        _interval(f"{where}: frame {row}", intervals[row], array.size, MAX_AGENTS)
-    _interval(where, np.array([first, last]), array.size, MAX_AGENTS)
+        frame = f"{where}: frame {bad[0]}"
+        _interval(frame, intervals[bad[0]], array.size, MAX_AGENTS)
+    hull = np.array([intervals[:, 0].min(), intervals[:, 1].max()])
+    first, last = _interval(where, hull, array.size, MAX_AGENTS)
     if counts.sum() > MAX_AGENTS:
         raise InputError(
             f"{where}: {counts.sum()} records: expected at most {MAX_AGENTS}"
@@ -357,24 +347,4 @@ def _records(
     frame = np.repeat(np.arange(counts.size), counts)
     inside = np.arange(frame.size) - np.repeat(np.cumsum(counts) - counts, counts)
     pick = intervals[:, 0].astype(np.int64)[frame] - first + inside
-    records = array.read(first, last)
-    return records[pick], frame
-
-
-def _signals(
-    where: str,
-    dataset: _Dataset,
-    frames: np.ndarray,
-    t: np.ndarray,
-    semantic_map: SemanticMap,
-    lanes: tuple[Lane, ...],
-) -> tuple[tuple[Signal, ...], list[str]]:
-    """Lights of the lanes, from the faces seen in each frame."""
-    if dataset.faces is None:
-        return (), ["no traffic lights recorded"]
-    faces, frame = _records(
-        f"{where}: {FACE_INTERVAL}", dataset.faces, frames[FACE_INTERVAL]
-    )
-    status = faces["traffic_light_face_status"]
-    lit = status.argmax(axis=1) == 0 if faces.size else np.zeros(0, bool)
-    return semantic_map.signals(lanes, t, frame, faces["face_id"], lit), []
+    return array.read(first, last)[pick], frame

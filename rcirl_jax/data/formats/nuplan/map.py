@@ -14,7 +14,6 @@ A connector leaves its "exit lane" and enters its "entry lane". Lanes of a group
 are numbered from left to right.
 """
 
-import dataclasses
 import functools
 import re
 import struct
@@ -32,6 +31,7 @@ from rcirl_jax.data.formats.shapes import (
     MIN_HALF_WIDTH_M,
     Roads,
     distance_to_line,
+    limit_of,
     line_across,
     moves,
 )
@@ -41,7 +41,6 @@ from rcirl_jax.types import Lane
 
 HALF_WIDTH_M = 1.75  # m, where a lane's bounds are not in the map
 MAX_HALF_WIDTH_M = 6.0  # m; a bound farther off is another lane's
-MAX_LIMIT_MPS = 60.0  # m/s; faster "limits" are none
 STOP_SIGN = 1  # stop_polygon_type_fid
 NONE = -1  # no feature's number
 FOLDERS_UP = 6  # folders above a log in which those of maps are looked for
@@ -54,15 +53,9 @@ LINE, POLYGON, MULTI_LINE, MULTI_POLYGON = 2, 3, 5, 6
 EWKB_Z, EWKB_M = 0x80000000, 0x40000000
 GEOGRAPHIC = 4326  # WGS84 longitude and latitude in degrees
 EPSG = re.compile(r"(?:epsg:)?(\d{4,6})", re.IGNORECASE)
-GEOMETRIES = ("table_name", "column_name", "srs_id")
-CENTRES = ("lane_fid", "lane_connector_fid")
-LANES = ("lane_fid", "lane_group_fid", "lane_index", "speed_limit_mps")
-CONNECTORS = ("fid", "exit_lane_fid", "entry_lane_fid", "speed_limit_mps")
-LIGHTS = ("traffic_light_stop_line_fids",)
+NEEDED = ("baseline_paths", "lane_connectors", "lanes_polygons")  # layers
 BOUNDS = ("left_boundary_fid", "right_boundary_fid")
 CONNECTOR_BOUNDS = "gen_lane_connectors_scaled_width_polygons"
-STOPS = ("fid", "stop_polygon_type_fid")
-STOP_USERS = ("lane_fids", "lane_connector_fids")
 
 
 def find_map(file: Path, names: Sequence[str], spec: Mapping) -> Path | None:
@@ -74,15 +67,12 @@ def find_map(file: Path, names: Sequence[str], spec: Mapping) -> Path | None:
         location "las_vegas", which names the folder that contains it.
       spec: `maps` names the folder of the maps; relative to a folder above the log.
     """
-    given = path_option(spec, "maps")
-    above = list(file.resolve().parents)[:FOLDERS_UP]
-    roots = [
-        folder / n for folder in above for n in ([given] if given else MAP_FOLDERS)
-    ]
-    for root in [Path(given), *roots] if given else roots:
-        for name in names:
-            if not (root.is_dir() and SAFE_NAME.fullmatch(name)):
-                continue
+    given, above = path_option(spec, "maps"), file.resolve().parents[:FOLDERS_UP]
+    roots = [folder / name for folder in above for name in MAP_FOLDERS]
+    if given:
+        roots = [folder / given for folder in (Path(), *above)]
+    for root in filter(Path.is_dir, roots):
+        for name in filter(SAFE_NAME.fullmatch, names):
             part = name.replace("_", "-").lower()
             folders = [f for f in sorted(root.iterdir()) if part in f.name.lower()]
             chosen = [folder for folder in folders if folder.name == name] or folders
@@ -106,54 +96,46 @@ def points_of(blob: object) -> np.ndarray:
     Raises:
       ValueError: no GeoPackage blob, another geometry, or a count beyond it.
     """
-    if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
+    if not isinstance(blob, bytes) or blob[:2] != b"GP":
         raise ValueError("no GeoPackage geometry")
-    code = blob[3] >> 1 & 7
-    if code >= len(ENVELOPE_BYTES):
-        raise ValueError(f"envelope {code}")
-    if blob[3] & 0x10:  # empty
-        return np.zeros((0, 2))
     try:
-        parts, _ = _well_known(blob, 8 + ENVELOPE_BYTES[code], 0)
+        if blob[3] & 0x10:  # empty
+            return np.zeros((0, 2))
+        parts, _ = _lines(blob, 8 + ENVELOPE_BYTES[blob[3] >> 1 & 7])
     except (struct.error, IndexError) as error:
         raise ValueError("well-known binary cut short") from error
     return max(parts, key=len, default=np.zeros((0, 2)))
 
 
-def _well_known(blob: bytes, at: int, depth: int) -> tuple[list[np.ndarray], int]:
-    """(lines or outer rings, place behind them) of well-known binary."""
-    if blob[at] > 1 or depth > 1:
-        raise ValueError("well-known binary cut short")
+def _lines(
+    blob: bytes,
+    at: int,
+    kinds: Sequence[int] = (LINE, POLYGON, MULTI_LINE, MULTI_POLYGON),
+) -> tuple[list[np.ndarray], int]:
+    """Lines or outer rings, of some kinds, of well-known binary; the place behind."""
     order = "<" if blob[at] else ">"
-    kind, count = struct.unpack_from(order + "II", blob, at + 1)
-    size = 2 + bool(kind & EWKB_Z) + bool(kind & EWKB_M)
-    flat = kind & 0x0FFFFFFF
-    size += (0, 1, 1, 2)[flat // 1000] if flat < 4000 else 0
-    kind, at = flat % 1000, at + 9
-
-    def points(at: int, count: int) -> tuple[np.ndarray, int]:
-        end = at + 8 * size * count
-        if end > len(blob):
-            raise ValueError(f"{count} points in {len(blob) - at} bytes")
-        values = np.frombuffer(blob, order + "f8", size * count, at)
-        return values.reshape(count, size)[:, :2].astype(np.float64), end
-
-    found = []
-    if kind == LINE:
-        line, at = points(at, count)
-        return [line], at
-    if kind == POLYGON:  # the outer ring is the first; inner ones are stepped over
-        for _ in range(min(count, len(blob))):
-            (number,) = struct.unpack_from(order + "I", blob, at)
-            ring, at = points(at + 4, number)
-            found.append(ring)
-        return found[:1], at
-    if kind not in (MULTI_LINE, MULTI_POLYGON):
+    code, count = struct.unpack_from(order + "II", blob, at + 1)
+    size = 2 + bool(code & EWKB_Z) + bool(code & EWKB_M)
+    thousands, kind = divmod(code & 0x0FFFFFFF, 1000)  # Z, M, ZM of ISO
+    size += (0, 1, 1, 2)[thousands]
+    at += 9
+    if kind not in kinds:
         raise ValueError(f"geometry type {kind}")
-    for _ in range(min(count, len(blob))):
-        parts, at = _well_known(blob, at, depth + 1)
-        found += parts
-    return found, at
+    if kind in (MULTI_LINE, MULTI_POLYGON):
+        every = []
+        for _ in range(count):
+            parts, at = _lines(blob, at, (kind - 3,))
+            every += parts
+        return every, at
+    rings = []
+    for _ in range(count if kind == POLYGON else 1):
+        if kind == POLYGON:
+            (count,) = struct.unpack_from(order + "I", blob, at)
+            at += 4
+        values = np.frombuffer(blob, order + "f8", size * count, at)
+        rings.append(values.reshape(count, size)[:, :2].astype(np.float64))
+        at += values.nbytes
+    return rings[:1], at  # inner rings are stepped over
 
 
 def zone_of(system: object) -> tuple[int, bool] | None:
@@ -167,36 +149,44 @@ def zone_of(system: object) -> tuple[int, bool] | None:
     return None
 
 
-class _Layers:
-    """Layers of one GeoPackage, projected to the UTM zone that its table meta names."""
+class _Package:
+    """A GeoPackage, projected to the UTM zone that its table meta names."""
 
     def __init__(self, database: Database) -> None:
-        self.database, value = database, "missing"
-        if database.columns("meta"):
-            found = dict(database.table("meta", ("key", "value"), MAX_ROWS))
-            value = found.get("projectedCoordSystem", value)
-        if (zone := zone_of(value)) is None:
-            field, expected = (
-                "meta: projectedCoordSystem",
-                "a UTM zone such as epsg:32611",
-            )
-            raise database.error(field, str(value), expected)
+        self.database = database
+        system = dict(self.rows("meta", ("key", "value"))).get("projectedCoordSystem")
+        zone = zone_of(system)
+        if zone is None:
+            found = "missing" if system is None else str(system)
+            expected = "a UTM zone such as epsg:32611"
+            raise database.error("meta: projectedCoordSystem", found, expected)
         self.zone = zone
-        about = "gpkg_geometry_columns"
-        has_about = database.columns(about)
-        rows = database.table(about, GEOMETRIES, MAX_ROWS) if has_about else ()
-        # a short name, of one line for errors
-        self._about = {
-            str(layer): (" ".join(str(column).split())[:MAX_NAME], srs)
-            for layer, column, srs in rows
+        columns = ("table_name", "column_name", "srs_id")
+        # layer -> its geometry's column (a short name, of one line), its system
+        self._geometry = {
+            str(layer): (" ".join(str(column).split())[:MAX_NAME], system)
+            for layer, column, system in self.rows("gpkg_geometry_columns", columns)
         }
+
+    def geometry(self, layer: str) -> tuple[str, object]:
+        """Returns the name of a layer's column of geometries, and their system."""
+        return self._geometry.get(layer, ("geom", GEOGRAPHIC))
 
     def rows(
         self, layer: str, columns: Sequence[str], optional: Sequence[str] = ()
     ) -> list[tuple]:
-        """Returns rows of a layer: the geometry's blob, columns, those optional."""
-        geometry = self._about.get(layer, ("geom", GEOGRAPHIC))[0]
-        return self.database.table(layer, (geometry, *columns), MAX_ROWS, optional)
+        """Returns the columns of a layer, and optional ones; none without the layer."""
+        if layer not in NEEDED and not self.database.columns(layer):
+            return []
+        return self.database.table(layer, columns, MAX_ROWS, optional)
+
+    def shapes(
+        self, layer: str, columns: Sequence[str], optional: Sequence[str] = ()
+    ) -> list[tuple]:
+        """Returns rows as `rows`, before each the points [n, 2] m of its geometry."""
+        table = self.rows(layer, (self.geometry(layer)[0], *columns), optional)
+        lines = self.lines(layer, [row[0] for row in table])
+        return [(line, *row[1:]) for line, row in zip(lines, table, strict=True)]
 
     def lines(self, layer: str, blobs: Sequence[object]) -> list[np.ndarray]:
         """Returns [n, 2] m of each geometry of a layer.
@@ -207,47 +197,34 @@ class _Layers:
         """
         if not blobs:
             return []
-        column, system = self._about.get(layer, ("geom", GEOGRAPHIC))
-        database, where = self.database, f"{layer}.{column}"
+        column, system = self.geometry(layer)
+        error, where = self.database.error, f"{layer}.{column}"
         try:
             found = [points_of(blob) for blob in blobs]
-        except ValueError as error:
-            raise database.error(where, str(error), "a GeoPackage geometry") from error
-        longest = max(map(len, found), default=0)
+        except ValueError as fault:
+            raise error(where, str(fault), "a GeoPackage geometry") from fault
+        longest = max(map(len, found))
         if longest > MAX_POINTS:
-            raise database.error(where, f"{longest} points", f"at most {MAX_POINTS}")
-        every = np.concatenate([np.zeros((0, 2)), *found])
+            raise error(where, f"{longest} points", f"at most {MAX_POINTS}")
+        every = np.concatenate(found)
         is_degrees = system == GEOGRAPHIC
         limits = np.array([180.0, 84.0]) if is_degrees else MAX_COORDINATE_M
         bad = every[~(np.abs(every) <= limits)]
         if bad.size:
             expected = "longitude, latitude in degrees" if is_degrees else "metres"
-            raise database.error(where, f"{bad[0]:g}", expected)
+            raise error(where, f"{bad[0]:g}", expected)
         if is_degrees:
             every = utm(every[:, 1], every[:, 0], self.zone[0], south=self.zone[1])
         elif zone_of(system) != self.zone:
-            raise database.error(
-                f"{layer}: srs_id", str(system), f"{GEOGRAPHIC} or the log's UTM zone"
-            )
+            expected = f"{GEOGRAPHIC} or the log's UTM zone"
+            raise error(f"{layer}: srs_id", str(system), expected)
         return np.split(every, np.cumsum([len(line) for line in found])[:-1])
 
 
 # ---------------------------------------------------------------------- lanes
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Row:
-    """A lane or connector as the map's tables have it."""
-
-    id: str
-    limit: Any  # m/s, if it is a number
-    bounds: tuple[int, int]  # fids of left, right
-    successors: tuple[str, ...]
-    left: str | None = None
-    right: str | None = None
-    signal: str | None = None
-    stops: tuple[int, ...] = ()  # fids of stop polygons
-    has_sign: bool = False
+# fids of a lane's left and right bound, fids of what stops it, other fields of the lane
+_Row = tuple[Sequence[int], Sequence[int], dict[str, Any]]
 
 
 class NuplanMap:
@@ -256,137 +233,110 @@ class NuplanMap:
     def __init__(self, file: Path) -> None:
         """Reads all tables; geometries of lanes' bounds stay blobs."""
         with Database(file) as database:
-            self._layers = layers = _Layers(database)
+            self._package = package = _Package(database)
             self._stops: dict[int, np.ndarray] = {}  # middle [2] m by fid
-            lane_signs, connector_signs = self._read_stops()
-            rows, leaving = self._connectors(connector_signs)
-            rows |= self._lanes(lane_signs, leaving)
-            table = layers.rows("baseline_paths", CENTRES)
-            lines = layers.lines("baseline_paths", [row[0] for row in table])
-            self._centres: dict[str, np.ndarray] = {}
-            for line, (_, lane, connector) in zip(lines, table, strict=True):
+            rows = self._read_rows()
+            centres: dict[str, np.ndarray] = {}
+            ways = ("lane_fid", "lane_connector_fid")
+            for line, lane, connector in package.shapes("baseline_paths", ways):
                 fid = _fid(lane)
                 name = f"connector-{_fid(connector)}" if fid == NONE else str(fid)
                 line = line[moves(line)] if len(line) else line
                 if len(line) >= 2 and name in rows:
-                    self._centres[name] = line
-            self._bounds: dict[int, object] = {}
-            if database.columns("boundaries"):
-                table = layers.rows("boundaries", ("fid",))
-                self._bounds = {_fid(fid): blob for blob, fid in table}
-        self._rows = [rows[name] for name in self._centres]
-        self.roads = Roads([*self._centres.values()], functools.cache(self._make))
+                    centres[name] = line
+            columns = (package.geometry("boundaries")[0], "fid")
+            table = package.rows("boundaries", columns)
+            self._bounds = {_fid(fid): blob for blob, fid in table}
+        self._lanes = [(line, *rows[name]) for name, line in centres.items()]
+        self.roads = Roads([*centres.values()], functools.cache(self._make))
 
-    def _read_stops(self) -> tuple[dict[int, int], dict[int, int]]:
-        """Stop signs' polygons by the lane, and by the connector, that they govern."""
-        lanes, connectors = {}, {}
-        if self._layers.database.columns("stop_polygons"):
-            table = self._layers.rows("stop_polygons", STOPS, STOP_USERS)
-            rings = self._layers.lines("stop_polygons", [row[0] for row in table])
-            kinds = {}
-            for ring, (_, number, kind, *users) in zip(rings, table, strict=True):
-                if len(ring):
-                    middle = ring[:-1].mean(axis=0) if len(ring) > 1 else ring[0]
-                    self._stops[_fid(number)] = middle
-                    kinds[_fid(number)] = _fid(kind), *map(_fids, users)
-            for fid, (kind, ways, across) in kinds.items():
-                if kind == STOP_SIGN:
-                    connectors |= dict.fromkeys(across, fid)
-                    lanes |= dict.fromkeys(() if across else ways, fid)
-        return lanes, connectors
-
-    def _connectors(
-        self, signs: Mapping[int, int]
-    ) -> tuple[dict[str, _Row], dict[int, list[str]]]:
-        """Connectors by id, and ids of those that leave a lane."""
-        database, bounds = self._layers.database, {}
-        names = ("lane_connector_fid", *BOUNDS)
-        if set(names) <= set(database.columns(CONNECTOR_BOUNDS)):
-            for row in database.table(CONNECTOR_BOUNDS, names, MAX_ROWS):
-                fid, left, right = map(_fid, row)
-                bounds[fid] = left, right
-        found, leaving = {}, {}
-        for number, leaves, enters, limit, stops in database.table(
-            "lane_connectors", CONNECTORS, MAX_ROWS, LIGHTS
+    def _read_rows(self) -> dict[str, _Row]:
+        """Lanes and connectors by id; middles of stop polygons are kept on the way."""
+        package = self._package
+        lane_signs: dict[int, int] = {}  # lane, or connector -> its stop sign's polygon
+        signs: dict[int, int] = {}
+        columns = ("fid", "stop_polygon_type_fid")
+        users = ("lane_fids", "lane_connector_fids")
+        for ring, number, kind, *governed in package.shapes(
+            "stop_polygons", columns, users
         ):
-            fid, lines = _fid(number), _fids(stops)
-            name = f"connector-{fid}"
+            fid, (ways, across) = _fid(number), map(_fids, governed)
+            if len(ring):
+                self._stops[fid] = ring[:-1].mean(axis=0) if len(ring) > 1 else ring[0]
+                if _fid(kind) == STOP_SIGN:
+                    signs |= dict.fromkeys(across, fid)
+                    lane_signs |= dict.fromkeys(() if across else ways, fid)
+        table = package.rows(CONNECTOR_BOUNDS, (), ("lane_connector_fid", *BOUNDS))
+        bounds = {_fid(fid): [*map(_fid, sides)] for fid, *sides in table}
+        rows: dict[str, _Row] = {}
+        leaving: dict[int, list[str]] = {}  # lane -> connectors
+        columns = ("fid", "exit_lane_fid", "entry_lane_fid", "speed_limit_mps")
+        for number, leaves, enters, limit, lights in package.rows(
+            "lane_connectors", columns, ("traffic_light_stop_line_fids",)
+        ):
+            fid, lines = _fid(number), _fids(lights)
+            name, sign = f"connector-{fid}", [signs[fid]] if fid in signs else []
             leaving.setdefault(_fid(leaves), []).append(name)
-            found[name] = _Row(
-                id=name,
-                limit=limit,
-                bounds=bounds.get(fid, (NONE, NONE)),
-                successors=(str(_fid(enters)),),
-                signal=str(fid) if lines else None,
-                stops=lines or ((signs[fid],) if fid in signs else ()),
-                has_sign=fid in signs and not lines,
-            )
-        return found, leaving
-
-    def _lanes(
-        self, signs: Mapping[int, int], leaving: Mapping[int, Sequence[str]]
-    ) -> dict[str, _Row]:
-        database = self._layers.database
-        has_bounds = set(BOUNDS) <= set(database.columns("lanes_polygons"))
-        bounds = BOUNDS if has_bounds else ("", "")
-        table = [
-            (*map(_fid, row[:3]), row[3], (_fid(row[4]), _fid(row[5])))
-            for row in database.table("lanes_polygons", LANES, MAX_ROWS, bounds)
-        ]
-        place = {
-            (group, index): str(fid)
-            for fid, group, index, *_ in table
-            if NONE not in (group, index)
-        }
-        found = {}
-        for fid, group, index, limit, beside in table:
-            is_placed = index != NONE
-            found[str(fid)] = _Row(
-                id=str(fid),
-                limit=limit,
-                bounds=beside,
-                successors=tuple(leaving.get(fid, ())),
-                left=place.get((group, index - 1)) if is_placed else None,
-                right=place.get((group, index + 1)) if is_placed else None,
-                stops=(signs[fid],) if fid in signs else (),
-                has_sign=fid in signs,
-            )
-        return found
+            fields = {
+                "id": name,
+                "speed_limit": limit_of(limit),
+                "successors": (str(_fid(enters)),),
+                "signal_ids": (str(fid),) if lines else (),
+                "stop_sign": bool(sign and not lines),
+            }
+            rows[name] = bounds.get(fid, (NONE, NONE)), lines or sign, fields
+        columns = ("lane_fid", "lane_group_fid", "lane_index", "speed_limit_mps")
+        table = package.rows("lanes_polygons", columns, BOUNDS)
+        places = [(*map(_fid, row[:3]),) for row in table]
+        lane_at = {(group, index): str(fid) for fid, group, index in places}
+        for (fid, group, index), (*_, limit, left, right) in zip(
+            places, table, strict=True
+        ):
+            beside = [
+                lane_at.get((group, index + step))
+                if NONE not in (group, index)
+                else None
+                for step in (-1, 1)
+            ]
+            sign = [lane_signs[fid]] if fid in lane_signs else []
+            fields = {
+                "id": str(fid),
+                "speed_limit": limit_of(limit),
+                "successors": tuple(leaving.get(fid, ())),
+                "left": beside[0] if index else None,  # 0 is the leftmost
+                "right": beside[1],
+                "stop_sign": bool(sign),
+            }
+            rows[str(fid)] = (_fid(left), _fid(right)), sign, fields
+        return rows
 
     def _make(self, index: int) -> Lane:
-        row = self._rows[index]
-        centre = self._centres[row.id]
+        centre, bounds, stops, fields = self._lanes[index]
         sides, assumed = [], False
-        for fid in row.bounds:  # distance [n] m of each from the centre line's points
-            line = np.zeros((0, 2))
-            if fid in self._bounds:
-                (line,) = self._layers.lines("boundaries", [self._bounds[fid]])
+        for fid in bounds:  # distance [n] m of each from the centre line's points
+            blobs = [self._bounds[fid]] if fid in self._bounds else []
+            line = np.concatenate(
+                [np.zeros((0, 2)), *self._package.lines("boundaries", blobs)]
+            )
             half = np.full(len(centre), HALF_WIDTH_M)
             if len(line):
                 half = distance_to_line(centre, line)
             sides.append(np.clip(half, MIN_HALF_WIDTH_M, MAX_HALF_WIDTH_M))
             assumed |= not len(line)
-        stop, limit = None, row.limit
-        if row.signal is not None or row.has_sign:
-            places = [self._stops[fid] for fid in row.stops if fid in self._stops]
-            start = centre[0]
-            near = min(places, key=lambda p: np.hypot(*(p - start)), default=start)
-            stop = line_across(centre, sides[0], sides[1], near)
-        known = isinstance(limit, int | float) and 0.0 < limit <= MAX_LIMIT_MPS
-        speed_limit = float(limit) if known else None
+        line = None
+        if stops:
+            places = [self._stops[fid] for fid in stops if fid in self._stops]
+            near = min(
+                places, key=lambda p: np.hypot(*(p - centre[0])), default=centre[0]
+            )
+            line = line_across(centre, sides[0], sides[1], near)
         return Lane(
-            id=row.id,
             centre=centre,
             left_width=sides[0],
             right_width=sides[1],
-            speed_limit=speed_limit,
-            successors=row.successors,
-            left=row.left,
-            right=row.right,
-            stop_line=stop,
-            signal_ids=() if row.signal is None else (row.signal,),
-            stop_sign=row.has_sign,
+            stop_line=line,
             width_assumed=assumed,
+            **fields,
         )
 
 
