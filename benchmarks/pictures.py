@@ -22,8 +22,7 @@ from PIL import Image
 
 from benchmarks.drawings import driven, ideas, numbers, recorded
 from rcirl_jax.cli.running import provenance
-from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.data.store.joined import open_datasets
+from rcirl_jax.data.store.dataset import open_dataset, open_datasets
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.report.compare import read_run, write_comparison
 from rcirl_jax.report.data_page import write_data_page

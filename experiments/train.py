@@ -12,7 +12,7 @@ from pathlib import Path
 from absl import flags
 
 from rcirl_jax.cli.running import provenance, run
-from rcirl_jax.data.store.joined import open_datasets
+from rcirl_jax.data.store.dataset import open_datasets
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.reward import LOSSES
 from rcirl_jax.reward.network import CONSTRAINTS, PINS

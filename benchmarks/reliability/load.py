@@ -29,8 +29,8 @@ from absl import flags
 from benchmarks.common import LANE_TOML, untrained, write
 from benchmarks.reliability.memory import level, looking
 from rcirl_jax.cli.running import run
+from rcirl_jax.data.store.dataset import shard_key
 from rcirl_jax.data.store.files import MARK
-from rcirl_jax.data.store.manifest import shard_key
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, drive_here, run_suite
 from rcirl_jax.planner.rank import RankConfig

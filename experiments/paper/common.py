@@ -13,9 +13,8 @@ from rcirl_jax.cli.running import made_by_file, provenance
 from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.store.dataset import Dataset, open_dataset
-from rcirl_jax.data.store.joined import Demonstrations
-from rcirl_jax.data.store.resplit import Resplit
+from rcirl_jax.data.store.dataset import Dataset, Demonstrations, open_dataset
+from rcirl_jax.data.store.splits import Resplit
 from rcirl_jax.errors import InputError
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.runtime.atomic_files import write_json

@@ -55,8 +55,12 @@ from experiments.paper.common import (
     write,
 )
 from rcirl_jax.cli.running import made_by_file, provenance, run
-from rcirl_jax.data.store.dataset import Dataset
-from rcirl_jax.data.store.joined import Demonstrations, JoinedDatasets, open_datasets
+from rcirl_jax.data.store.dataset import (
+    Dataset,
+    Demonstrations,
+    JoinedDatasets,
+    open_datasets,
+)
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, rank_scenes

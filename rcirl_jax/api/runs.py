@@ -7,8 +7,7 @@ from typing import Any
 
 from rcirl_jax.api.logs import Place
 from rcirl_jax.api.training import folders_of, training_of
-from rcirl_jax.data.store.dataset import Dataset, open_dataset
-from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.dataset import Dataset, Demonstrations, open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.likeness import DRIVES
 from rcirl_jax.evaluation.closed_loop.suite import (

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.export.closed_loop import score_of
 from rcirl_jax.export.loading import features_of, reward_params

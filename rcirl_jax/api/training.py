@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from rcirl_jax.api.logs import Place
-from rcirl_jax.data.store.joined import Demonstrations, open_datasets
+from rcirl_jax.data.store.dataset import Demonstrations, open_datasets
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.reward import RewardConfig

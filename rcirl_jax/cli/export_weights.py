@@ -21,8 +21,8 @@ from pathlib import Path
 from absl import flags
 
 from rcirl_jax.cli.running import provenance
-from rcirl_jax.data.store.joined import open_datasets
-from rcirl_jax.data.store.resplit import with_tags
+from rcirl_jax.data.store.dataset import open_datasets
+from rcirl_jax.data.store.splits import with_tags
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.forms.linear_yaml import reward_yaml
 from rcirl_jax.export.forms.onnx_model import write_onnx

@@ -17,8 +17,8 @@ from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.inputs import InputFile
 from rcirl_jax.data.scenes.config import SignalChecks, signal_checks
 from rcirl_jax.data.scenes.signal_phases import check_written, format_phases
-from rcirl_jax.data.store.joined import EQUAL, Demonstrations
-from rcirl_jax.data.store.resplit import HOLDOUTS, folds_by_recording, held_out
+from rcirl_jax.data.store.dataset import EQUAL, Demonstrations
+from rcirl_jax.data.store.splits import HOLDOUTS, folds_by_recording, held_out
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.baselines import SEARCHES
 from rcirl_jax.evaluation.gate.types import GateConfig

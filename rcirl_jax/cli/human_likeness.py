@@ -24,8 +24,7 @@ from absl import flags
 
 from rcirl_jax.cli import flags as shared
 from rcirl_jax.cli.running import provenance
-from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.dataset import Demonstrations, open_dataset
 from rcirl_jax.evaluation.baselines import as_numbers, tuned_baselines
 from rcirl_jax.evaluation.ranking.evaluate import (
     RankingSetup,

@@ -14,7 +14,7 @@ from rcirl_jax.api.runs import rank
 from rcirl_jax.cli import flags as shared
 from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.data.store.resplit import with_tags
+from rcirl_jax.data.store.splits import with_tags
 from rcirl_jax.evaluation.ranking.report import format_table, to_json
 from rcirl_jax.runtime.atomic_files import write_json
 

@@ -16,7 +16,7 @@ from absl import flags
 
 from rcirl_jax.cli import flags as shared
 from rcirl_jax.cli.running import provenance
-from rcirl_jax.data.store.joined import JoinedDatasets, open_datasets
+from rcirl_jax.data.store.dataset import JoinedDatasets, open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.likeness import (
     DRIVES,

@@ -18,8 +18,8 @@ from absl import flags
 
 from rcirl_jax.cli import flags as shared
 from rcirl_jax.cli.running import provenance
-from rcirl_jax.data.store.joined import open_datasets
-from rcirl_jax.data.store.resplit import with_tags
+from rcirl_jax.data.store.dataset import open_datasets
+from rcirl_jax.data.store.splits import with_tags
 from rcirl_jax.train.loop import Running, train
 from rcirl_jax.train.parallel import PARALLEL, is_first, join_processes, share_cores
 

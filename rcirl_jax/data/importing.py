@@ -33,9 +33,8 @@ from rcirl_jax.data.inputs import (
 from rcirl_jax.data.quality import QualityReport, remedies
 from rcirl_jax.data.scenes.collect import CHUNK, Collector, assemble
 from rcirl_jax.data.scenes.config import CollectConfig, SignalChecks
-from rcirl_jax.data.store.dataset import Dataset
+from rcirl_jax.data.store.dataset import Dataset, Manifest
 from rcirl_jax.data.store.files import Files
-from rcirl_jax.data.store.manifest import Manifest
 from rcirl_jax.data.store.rows import check_finite
 from rcirl_jax.data.store.splits import split_wholes, time_blocks
 from rcirl_jax.data.store.writer import DatasetWriter

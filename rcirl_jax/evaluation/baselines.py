@@ -29,7 +29,7 @@ import tqdm
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.errors import InputError, extra_module
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, covered_rows
 from rcirl_jax.evaluation.ranking.score import Baseline, chunks, horizon_mask, measured

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.errors import MALFORMED, InputError
 from rcirl_jax.export.reader import PriorCost, Reward
 from rcirl_jax.export.weights import FeatureSpec, RewardWeights, save

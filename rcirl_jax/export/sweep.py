@@ -5,7 +5,7 @@ network shape train side by side in one compiled program (`train.sweep`); such a
 is the piece of work that goes to an executor, and nothing depends on where it ran.
 
 The training split is cut into scenes to fit and scenes to choose by, by group of
-vehicles or by vehicle (`data.store.resplit.with_validation`). A point is judged by the
+vehicles or by vehicle (`data.store.splits.with_validation`). A point is judged by the
 mean of its seeds on the validation scenes. The test split is scored afterwards, for the
 chosen point alone, so nothing can be chosen by it.
 
@@ -32,8 +32,8 @@ import jax.numpy as jnp
 import numpy as np
 import tqdm
 
-from rcirl_jax.data.store.joined import Demonstrations, open_datasets
-from rcirl_jax.data.store.resplit import Resplit, subsample, with_validation
+from rcirl_jax.data.store.dataset import Demonstrations, open_datasets
+from rcirl_jax.data.store.splits import Resplit, subsample, with_validation
 from rcirl_jax.errors import MALFORMED, InputError, extra_module
 from rcirl_jax.evaluation.baselines import new_study
 from rcirl_jax.evaluation.ranking.evaluate import (

@@ -16,7 +16,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
 
-from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.attribution import attribute
 from rcirl_jax.evaluation.ranking.score import candidates_key

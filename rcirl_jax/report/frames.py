@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 
-from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.evaluation.attribution import attribute
 from rcirl_jax.evaluation.ranking.score import candidates_key
 from rcirl_jax.export.closed_loop import incumbent_score

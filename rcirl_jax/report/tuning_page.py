@@ -9,8 +9,7 @@ import numpy as np
 import tqdm
 
 from rcirl_jax.data.quality import format_quality
-from rcirl_jax.data.store.dataset import Dataset
-from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.dataset import Dataset, Demonstrations
 from rcirl_jax.evaluation.closed_loop.runs import SuiteRuns
 from rcirl_jax.evaluation.closed_loop.summary import (
     PAPER,

@@ -26,9 +26,8 @@ import numpy as np
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.scenes.collect import assemble
 from rcirl_jax.data.scenes.labels import add_labels
-from rcirl_jax.data.store.dataset import Dataset
+from rcirl_jax.data.store.dataset import Dataset, Manifest
 from rcirl_jax.data.store.files import Files
-from rcirl_jax.data.store.manifest import Manifest
 from rcirl_jax.data.store.splits import assign_groups
 from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError

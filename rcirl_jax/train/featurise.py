@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.data.store.rows import check_finite, refuse_scenes
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.features.columns import Frame, candidate_frames

@@ -21,7 +21,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from rcirl_jax.data.store.batches import Prefetch, split_batches
-from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.data.store.rows import scene_name, unusable_leaves
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map

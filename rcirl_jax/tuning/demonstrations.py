@@ -18,8 +18,12 @@ from pathlib import Path
 from rcirl_jax.data.formats.files import listing
 from rcirl_jax.data.importing import Logs, import_logs
 from rcirl_jax.data.inputs import input_files
-from rcirl_jax.data.store.dataset import Dataset, open_dataset
-from rcirl_jax.data.store.joined import Demonstrations, JoinedDatasets
+from rcirl_jax.data.store.dataset import (
+    Dataset,
+    Demonstrations,
+    JoinedDatasets,
+    open_dataset,
+)
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import incumbent_score, table_rows
 from rcirl_jax.planner.rank import Params, Policy, RankConfig, rank_policy

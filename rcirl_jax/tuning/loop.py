@@ -15,8 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from rcirl_jax.data.importing import Logs
-from rcirl_jax.data.store.dataset import Dataset
-from rcirl_jax.data.store.joined import Demonstrations, shares_of
+from rcirl_jax.data.store.dataset import Dataset, Demonstrations, shares_of
 from rcirl_jax.errors import InputError, extra_of
 from rcirl_jax.evaluation.gate.types import CANDIDATE, Verdict
 from rcirl_jax.evaluation.gate.words import WIDTH

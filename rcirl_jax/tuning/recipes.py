@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.store.joined import EQUAL
+from rcirl_jax.data.store.dataset import EQUAL
 from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.evaluation.gate.types import GateConfig
 from rcirl_jax.export.sweep import read_sweep
@@ -280,7 +280,7 @@ class TuneConfig:
         default_factory=SimulatedDemonstrations
     )
     prior_cost: PriorCostConfig = PriorCostConfig()
-    data_weights: str = EQUAL  # of several sources, as `data.store.joined.shares_of`
+    data_weights: str = EQUAL  # of several sources, as `data.store.dataset.shares_of`
     recipe: str = ""  # its name, for the report
     seeds: int = 1
     search: str = "cma"  # of the tuned IDM: one of `baselines.SEARCHES`

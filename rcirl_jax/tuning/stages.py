@@ -9,8 +9,7 @@ import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from rcirl_jax.data.store.dataset import Dataset
-from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.dataset import Dataset, Demonstrations
 from rcirl_jax.evaluation.baselines import tune_idm
 from rcirl_jax.evaluation.closed_loop.likeness import (
     held_out_likeness,

@@ -129,7 +129,6 @@ def test_one_recording_is_split_by_when_vehicles_are_first_seen(tmp_path, group)
     made = dataclasses.replace(recording(one, two, three), group=group)
     import_logs([validate_recording(made)], tmp_path / "data", CONFIG)
     dataset = open_dataset(tmp_path / "data")
-    dataset.check_tables()
     names = dataset.manifest.vehicles
     driven = {
         split: {names[n].rpartition(":")[2] for n in dataset.load(split).vehicle}

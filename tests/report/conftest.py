@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from rcirl_jax.data.store.joined import JoinedDatasets
+from rcirl_jax.data.store.dataset import JoinedDatasets
 from rcirl_jax.report import tuning_page
 from rcirl_jax.report.replays import make_replays
 from rcirl_jax.report.tuning_page import write_tuning_page

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.data.store.resplit import Resplit, with_validation
+from rcirl_jax.data.store.splits import Resplit, with_validation
 from rcirl_jax.errors import InputError
 from rcirl_jax.export import sweep
 from rcirl_jax.export.loading import compiled_scorer, open_reward

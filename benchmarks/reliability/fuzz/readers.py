@@ -19,8 +19,7 @@ from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.formats.csv.suggest import suggested
 from rcirl_jax.data.formats.recognise import recognised_format
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.data.store.files import MANIFEST, MARK
-from rcirl_jax.data.store.manifest import describe
+from rcirl_jax.data.store.files import MANIFEST, MARK, describe
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.runs import (
     COLUMNS,

@@ -5,13 +5,12 @@ use: reading single rows at random would unpack a block of 256 for each, so ever
 is unpacked once, and its rows wait in memory for their turn.
 """
 
-import functools
+import collections
 import math
-import queue
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Generic, TypeVar
+from concurrent.futures import ThreadPoolExecutor
+from typing import Generic, TypeVar
 
 import jax
 import numpy as np
@@ -31,7 +30,7 @@ T = TypeVar("T")
 
 
 def epoch_order(seed: int, epoch: int, blocks: np.ndarray) -> np.ndarray:
-    """Return the order [n] in which an epoch visits n rows.
+    """Returns the order [n] in which an epoch visits n rows.
 
         key(row) = place(block of row) + WINDOW_BLOCKS * u(row),   u ~ U(0, 1)
 
@@ -58,19 +57,17 @@ class RowStream:
     Rows of a block are read when the first of them is due, in one piece, and each
     is forgotten once it has been given. Memory is what the order demands, known
     beforehand and allocated once.
+
+    Args:
+      dataset: the open dataset.
+      rows: [m] row numbers in the order of use, repeats allowed.
+      blocks: [m] number of the block that each of them lies in.
+      size: rows given at a time; divides m.
     """
 
     def __init__(
         self, dataset: Demonstrations, rows: np.ndarray, blocks: np.ndarray, size: int
     ) -> None:
-        """Plan the reads.
-
-        Args:
-          dataset: the open dataset.
-          rows: [m] row numbers in the order of use, repeats allowed.
-          blocks: [m] number of the block that each of them lies in.
-          size: rows given at a time; divides m.
-        """
         self._dataset, self._rows, self._size = dataset, rows, size
         first = np.zeros(int(blocks.max()) + 1, np.int64)
         first[blocks[::-1]] = np.arange(blocks.size)[::-1]  # the last written stays
@@ -81,12 +78,16 @@ class RowStream:
         self.capacity = int(np.max(loaded - size * np.arange(loaded.size)))
         self._slot = np.empty(rows.size, np.int32)  # where a row in memory stands
         self._free = np.arange(self.capacity, dtype=np.int32)
+        self._held: Demonstration | None = None  # the rows in memory, [capacity, ...]
         self._turn = 0
 
     def __next__(self) -> Demonstration:
         turn, size = self._turn, self._size
-        if turn * size >= self._rows.size:
-            raise StopIteration
+        if self._held is None:
+            self._held = jax.tree.map(
+                lambda leaf: np.empty((self.capacity, *leaf.shape), leaf.dtype),
+                row_spec(),
+            )
         new = self._by_turn[self._bounds[turn] : self._bounds[turn + 1]]
         new = new[np.argsort(self._rows[new], kind="stable")]
         for start in range(0, new.size, READ_ROWS):
@@ -104,13 +105,6 @@ class RowStream:
         self._turn += 1
         return given
 
-    @functools.cached_property
-    def _held(self) -> Demonstration:
-        """The rows in memory, [capacity, ...], allocated when the first is due."""
-        return jax.tree.map(
-            lambda leaf: np.empty((self.capacity, *leaf.shape), leaf.dtype), row_spec()
-        )
-
 
 def split_batches(
     dataset: Demonstrations,
@@ -122,7 +116,7 @@ def split_batches(
     shard_index: int = 0,
     num_shards: int = 1,
 ) -> "BatchIterator":
-    """Return batches of a split, named by their rows in the dataset.
+    """Returns batches of a split, named by their rows in the dataset.
 
     A split of at most `in_memory_mb` MiB is loaded, a larger one is read as the
     batches need it: the batches are the same to the bit.
@@ -167,7 +161,7 @@ class BatchIterator:
         shard_index: int = 0,
         num_shards: int = 1,
     ) -> None:
-        """Start at epoch 0, position 0.
+        """Starts at epoch 0, position 0.
 
         Args:
           rows: Demonstration with numpy leaves [n, ...], or an open dataset, which
@@ -183,7 +177,7 @@ class BatchIterator:
           num_shards: number of processes; divides `batch_size`.
 
         Raises:
-          InputError: no rows, or a size or seed out of range.
+          InputError: no rows, or a batch size or seed out of range.
         """
         self._rows = rows
         stored = not isinstance(rows, Demonstration)
@@ -194,23 +188,13 @@ class BatchIterator:
             blocks = rows.blocks(self._chosen) if stored else alone
         self._blocks = np.unique(blocks, return_inverse=True)[1].astype(np.int32)
         self._numbers = self._chosen if numbers is None else numbers
-        multiple = batch_size >= 1 and num_shards >= 1 and batch_size % num_shards == 0
-        for is_good, what, expected in (
-            (self._chosen.size > 0, "rows: 0", "at least one scene"),
-            (
-                multiple,
-                f"batch_size: {batch_size}",
-                f"a positive multiple of the number of processes, {num_shards}",
-            ),
-            (
-                0 <= shard_index < num_shards,
-                f"shard_index: {shard_index}",
-                f"0 to {num_shards - 1}",
-            ),
-            (seed >= 0, f"seed: {seed}", ">= 0"),
-        ):
-            if not is_good:
-                raise InputError(f"batches: {what}: expected {expected}")
+        if self._chosen.size == 0:
+            raise InputError("batches: rows: 0: expected at least one scene")
+        if batch_size < 1 or batch_size % num_shards or seed < 0:
+            raise InputError(
+                f"batches: batch_size: {batch_size}, seed: {seed}: expected a positive "
+                f"multiple of the number of processes, {num_shards}, and a seed >= 0"
+            )
         self._batch_size, self._seed = batch_size, seed
         local = batch_size // num_shards
         self._part = np.arange(shard_index * local, (shard_index + 1) * local)
@@ -224,33 +208,24 @@ class BatchIterator:
         return -(-self._chosen.size // self._batch_size)
 
     def state(self) -> dict[str, int]:
-        """Return where the next batch stands; JSON-ready, equal in every process."""
+        """Returns where the next batch stands; JSON-ready, equal in every process."""
         return {"epoch": self._epoch, "position": self._position, "seed": self._seed}
 
     def restore(self, state: Mapping[str, int]) -> None:
-        """Continue as the iterator that gave `state` would have.
+        """Continues as the iterator that gave `state` would have.
 
         Raises:
           InputError: the state is of another seed, or lies outside an epoch of
             these rows.
         """
-        missing = sorted({"epoch", "position", "seed"} - set(state))
-        if missing:
+        epoch, position = state.get("epoch", -1), state.get("position", -1)
+        inside = epoch >= 0 and 0 <= position < self.batches_per_epoch
+        if not inside or state.get("seed") != self._seed:
             raise InputError(
-                f"batches: state: {missing[0]}: missing: expected a number"
+                f"batches: state: {dict(state)}: expected the seed {self._seed} and a "
+                f"position below {self.batches_per_epoch}: same dataset and batch size"
             )
-        if state["seed"] != self._seed:
-            raise InputError(
-                f"batches: state: seed: {state['seed']}: expected {self._seed}"
-            )
-        inside = 0 <= state["position"] < self.batches_per_epoch
-        if not inside or state["epoch"] < 0:
-            raise InputError(
-                f"batches: state: epoch {state['epoch']}, position "
-                f"{state['position']}: expected a position below "
-                f"{self.batches_per_epoch}: same dataset and batch size"
-            )
-        self._epoch, self._position = int(state["epoch"]), int(state["position"])
+        self._epoch, self._position = int(epoch), int(position)
         self._order = None
 
     def __iter__(self) -> "BatchIterator":
@@ -287,53 +262,36 @@ class BatchIterator:
 class Prefetch(Generic[T]):
     """Calls a function in a thread, a bounded number of results ahead.
 
+    Args:
+      produce: gives the next result; StopIteration ends, any other exception reaches
+        the caller in its turn.
+      depth: finished results that may wait, >= 1.
+
     `waited_s` is the time that `next` spent waiting for results.
     """
 
     def __init__(self, produce: Callable[[], T], depth: int) -> None:
-        """Start producing.
-
-        Args:
-          produce: gives the next result; StopIteration ends, any other exception
-            reaches the caller in its turn.
-          depth: finished results that may wait, >= 1.
-        """
-        self._results: queue.Queue[tuple[bool, Any]] = queue.Queue(depth)
-        self._stopped = threading.Event()
-        self._produce = produce
+        self._produce, self._thread = produce, ThreadPoolExecutor(1)
+        self._ahead = collections.deque(
+            self._thread.submit(produce) for _ in range(depth + 1)
+        )
         self.waited_s = 0.0
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        fine = True
-        while fine and not self._stopped.is_set():
-            try:
-                result = self._produce()
-            except BaseException as error:
-                fine, result = False, error
-            while not self._stopped.is_set():
-                try:
-                    self._results.put((fine, result), timeout=0.1)
-                    break
-                except queue.Full:
-                    continue
 
     def __iter__(self) -> Iterator[T]:
         return self
 
     def __next__(self) -> T:
         begin = time.perf_counter()
-        fine, result = self._results.get()
-        self.waited_s += time.perf_counter() - begin
-        if not fine:
-            self._results.put((fine, result))
-            raise result
+        try:
+            result = self._ahead[0].result()  # an end or failure stays the first
+        finally:
+            self.waited_s += time.perf_counter() - begin
+        self._ahead.popleft()
+        self._ahead.append(self._thread.submit(self._produce))
         return result
 
     def __enter__(self) -> "Prefetch[T]":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stopped.set()
-        self._thread.join()
+        self._thread.shutdown(cancel_futures=True)

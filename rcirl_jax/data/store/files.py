@@ -1,28 +1,45 @@
-"""Keys and values through tensorstore: a folder or any kvstore URL."""
+"""Files of a dataset, by tensorstore: a folder or any kvstore URL; and their digests.
+
+Checksums form a chain: manifest `hash` -> `sha256` of each shard.json -> sha256
+of each file. Both JSON files carry the sha256 of their own canonical form (sorted
+keys, no spaces, without that field). Nothing written depends on the time or the
+machine: equal scenes give equal bytes.
+"""
 
 import contextlib
 import functools
+import hashlib
+import json
 import os
-import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, Any, TypedDict, TypeVar
 
+import msgspec
 import tensorstore as ts
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.atomic_files import parse_json
 from rcirl_jax.runtime.pipeline import LOCK, only_one
 
 MANIFEST, MARK, SHARDS = "manifest.json", "shard.json", "shards/"
 FACTS = "made_by.json"  # beside the manifest, whose bytes depend on the logs alone
 # of each; the manifest of 10 million scenes takes some 10 MiB
 JSON_BYTES = {MANIFEST: 2**30, MARK: 2**28, FACTS: 2**28}
+SCHEMA_VERSION = 2  # of manifest.json and shard.json
 
 _T = TypeVar("_T")
 
 
+class FileEntry(TypedDict):
+    """Size and digest of a file."""
+
+    bytes: Annotated[int, msgspec.Meta(ge=0)]
+    sha256: Annotated[str, msgspec.Meta(pattern=r"\A[0-9a-f]{64}\Z")]
+
+
 class Files:
-    """Named values below one URL, by tensorstore's KvStore."""
+    """Named values below one URL."""
 
     def __init__(self, url: str | os.PathLike[str]) -> None:
         text = os.fspath(url)
@@ -39,7 +56,7 @@ class Files:
             ) from error
 
     def alone(self) -> contextlib.AbstractContextManager[None]:
-        """Hold the folder for this process; remote places cannot be held.
+        """Holds the folder for this process; remote places cannot be held.
 
         Raises:
           InputError: another process holds the folder.
@@ -49,11 +66,11 @@ class Files:
         return only_one(Path(self.folder), leave_nothing=True)
 
     def path(self, key: str) -> str:
-        """Return how messages call a key."""
+        """Returns how messages call a key."""
         return f"{self.name}/{key}"
 
     def wait(self, future: "ts.Future[_T]", key: str) -> _T:
-        """Return a read's result; a failure names the key."""
+        """Returns a read's result; a failure names the key."""
         try:
             return future.result()
         except ValueError as error:
@@ -63,14 +80,13 @@ class Files:
             ) from error
 
     def list_keys(self) -> list[str]:
-        """Return all keys below the dataset, but for the lock of who writes it.
+        """Returns all keys below the dataset, but for the lock of who writes it.
 
         Raises:
           InputError: one is no text.
         """
-        keys = self.wait(self.kv.list(), "")
         try:
-            found = [key.decode() for key in keys]
+            found = [key.decode() for key in self.wait(self.kv.list(), "")]
         except UnicodeDecodeError as error:
             raise InputError(
                 f"{self.name}: holds {error.object!r}: expected names in UTF-8"
@@ -78,7 +94,7 @@ class Files:
         return [key for key in found if key != LOCK]
 
     def read(self, most: Mapping[str, int]) -> dict[str, bytes | None]:
-        """Read values, all at once; None where there is none.
+        """Reads values, all at once; None where there is none.
 
         Args:
           most: key -> bytes that it may have; a longer file of a folder is not read.
@@ -86,80 +102,115 @@ class Files:
         Raises:
           InputError: one cannot be read, or is too large.
         """
-        for key in most if self.folder is not None else ():
-            try:
-                found = os.stat(os.path.join(self.folder or "", key))
-            except (FileNotFoundError, NotADirectoryError):
-                continue
-            except OSError as error:
+
+        def check(key: str, size: int) -> None:
+            if size > most[key]:
                 raise InputError(
-                    f"{self.path(key)}: cannot be read: {error.strerror}: "
-                    "expected a dataset's file"
-                ) from error
-            if not stat.S_ISREG(found.st_mode):  # of a pipe one would wait for bytes
-                raise InputError(f"{self.path(key)}: expected a file")
-            self._check_size(key, found.st_size, most[key])
+                    f"{self.path(key)}: {size} bytes: expected {most[key]} at most"
+                )
+
+        for key in most if self.folder is not None else ():
+            path = os.path.join(self.folder or "", key)
+            if os.path.exists(path):
+                if not os.path.isfile(path):  # of a pipe one would wait for bytes
+                    raise InputError(f"{self.path(key)}: expected a file")
+                check(key, os.path.getsize(path))
         values = {}
         for key, future in {key: self.kv.read(key) for key in most}.items():
             result = self.wait(future, key)
             values[key] = result.value if result.state == "value" else None
-            self._check_size(key, len(values[key] or b""), most[key])
+            check(key, len(values[key] or b""))
         return values
 
-    def _check_size(self, key: str, size: int, most: int) -> None:
-        if size > most:
-            raise InputError(f"{self.path(key)}: {size} bytes: expected {most} at most")
-
     def read_json(self, key: str) -> bytes | None:
-        """Read one of the dataset's JSON files; arguments and errors as `read`."""
+        """Reads one of the dataset's JSON files; errors as of `read`."""
         return self.read({key: JSON_BYTES[key.rpartition("/")[2]]})[key]
 
     def write_many(self, values: Mapping[str, bytes]) -> None:
-        """Write each value atomically; returns when all are on disk.
+        """Writes each value atomically; returns when all are on disk.
 
         Raises:
           OSError: one cannot be written.
         """
         futures = []
         try:
-            for key, value in values.items():
-                futures.append(put(self.kv, key, value))
-            for future in futures:
-                future.result()
-        except ValueError as error:
-            raise OSError(
-                f"{self.name}: cannot be written: {_reason(error)}"
-            ) from error
+            with self._writing():
+                for key, value in values.items():
+                    futures.append(put(self.kv, key, value))
+                for future in futures:
+                    future.result()
         finally:
             # a write still under way would land after an abort has cleaned up
             for future in futures:
                 future.exception()
 
     def remove(self, start: str, end: str) -> None:
-        """Delete the keys from `start` up to `end`.
-
-        Raises:
-          OSError: they cannot be deleted.
-        """
-        try:
+        """Deletes the keys from `start` up to `end`; OSError if they cannot be."""
+        with self._writing():
             self.kv.delete_range(ts.KvStore.KeyRange(start, end)).result()
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
         except ValueError as error:
             raise OSError(
-                f"{self.path(start)}: cannot be deleted: {_reason(error)}"
+                f"{self.name}: cannot be written: {_reason(error)}"
             ) from error
 
 
 def _reason(error: ValueError) -> str:
-    """Return tensorstore's message without the specification in brackets."""
+    """Returns tensorstore's message without the specification in brackets."""
     return str(error).split(" [")[0]
 
 
 @functools.cache
 def context() -> ts.Context:
-    """Return one context for all, so that a memory:// URL means one thing."""
+    """Returns one context for all, so that a memory:// URL means one thing."""
     return ts.Context()
 
 
 def put(kv: ts.KvStore, key: str, value: bytes) -> ts.Future:
-    """Start writing one value."""
+    """Starts writing one value."""
     return kv.write(key, value)
+
+
+# -------------------------------------------------------------------- checksums
+
+
+def describe(data: bytes) -> FileEntry:
+    """Returns size and sha256 of a file."""
+    return {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+
+
+def _canonical(payload: Mapping) -> str:
+    text = json.dumps(payload, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def seal(payload: Mapping, field: str) -> bytes:
+    """Returns JSON bytes of the payload with its own digest as one more field."""
+    whole = {**payload, field: _canonical(payload)}
+    return (json.dumps(whole, sort_keys=True, indent=1) + "\n").encode()
+
+
+def unseal(raw: bytes, field: str, name: str) -> dict[str, Any]:
+    """Parses `seal`'s bytes; InputError when they are not as written."""
+    try:
+        payload = parse_json(raw)
+    except ValueError as error:
+        raise InputError(
+            f"{name}: not JSON ({error}): expected the file as written; truncated?"
+        ) from error
+    found = payload.get("schema_version") if isinstance(payload, dict) else None
+    if found != SCHEMA_VERSION:
+        raise InputError(
+            f"{name}: schema_version: {found}: expected {SCHEMA_VERSION}; "
+            "import the logs again with this version"
+        )
+    sha = _canonical({k: v for k, v in payload.items() if k != field})
+    if sha != payload.get(field):
+        raise InputError(
+            f"{name}: {field}: contents {sha}: expected {payload.get(field)}; damaged"
+        )
+    return payload

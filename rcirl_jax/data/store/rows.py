@@ -23,78 +23,53 @@ from rcirl_jax.units import NUM_OBSTACLES, NUM_STATIONS, NUM_TIMES
 _T = TypeVar("_T")
 
 
-def _node(
-    kind: type[_T], shape: tuple, dtype: type = np.float32, /, **other: tuple
-) -> _T:
-    """Return a pytree node whose leaves have one shape and dtype, but for `other`."""
-    names = (field.name for field in dataclasses.fields(cast(Any, kind)))
-    return kind(**{x: _leaf(*other.get(x, (shape, dtype))) for x in names})
-
-
-def _leaf(shape: tuple, dtype: type) -> jax.Array:
+def _leaf(*shape: int, dtype: type = np.float32) -> jax.Array:
     # a description in an array's place, as jax.eval_shape has it
     return cast(jax.Array, jax.ShapeDtypeStruct(shape, dtype))
 
 
+def _node(kind: type[_T], /, *shape: int, **other: jax.Array) -> _T:
+    """Returns a pytree node of float32 leaves of one shape, but for `other`."""
+    names = (field.name for field in dataclasses.fields(cast(Any, kind)))
+    return kind(**{name: other.get(name, _leaf(*shape)) for name in names})
+
+
 def row_spec() -> Demonstration:
-    """Return shape and dtype of every leaf of one stored row."""
-    slots, motion = (NUM_OBSTACLES,), (NUM_OBSTACLES, NUM_TIMES)
+    """Returns shape and dtype of every leaf of one stored row."""
+    slots, numbers = _leaf(NUM_OBSTACLES), _leaf(NUM_OBSTACLES, dtype=np.int32)
+    valid = _leaf(NUM_OBSTACLES, NUM_TIMES, dtype=np.bool_)
+    motion = {"valid": valid, "kind": numbers, "a": slots, "l_dot": slots}
     scene = Scene(
-        ego=_node(Ego, ()),
-        path=_node(Path, (NUM_STATIONS,)),
-        obstacles=_node(
-            Obstacles,
-            motion,
-            valid=(motion, np.bool_),
-            kind=(slots, np.int32),
-            a=(slots, np.float32),
-            l_dot=(slots, np.float32),
-        ),
-        time_valid=_leaf((NUM_TIMES,), np.bool_),
-        tags=_leaf((NUM_TAGS,), np.bool_),
+        ego=_node(Ego),
+        path=_node(Path, NUM_STATIONS),
+        obstacles=_node(Obstacles, NUM_OBSTACLES, NUM_TIMES, **motion),
+        time_valid=_leaf(NUM_TIMES, dtype=np.bool_),
+        tags=_leaf(NUM_TAGS, dtype=np.bool_),
     )
-    return Demonstration(
-        scene=scene,
-        human=_node(Trajectory, (NUM_TIMES,)),
-        decisions=_leaf(slots, np.int32),
-        **{name: _leaf((), np.float32) for name in ("future_s", "s_at_5s")},
-        **{
-            name: _leaf((), np.int32)
-            for name in ("vehicle", "recording", "group", "frame")
-        },
+    whole = ("vehicle", "recording", "group", "frame")
+    return _node(
+        Demonstration,
+        scene=cast(jax.Array, scene),
+        human=cast(jax.Array, _node(Trajectory, NUM_TIMES)),
+        decisions=numbers,
+        **{name: _leaf(dtype=np.int32) for name in whole},
     )
 
 
 def named_leaves(rows: Demonstration) -> dict[str, Any]:
-    """Return leaves by path, e.g. "scene.path.kappa", in the order of the tree."""
+    """Returns leaves by path, e.g. "scene.path.kappa", in the order of the tree."""
     flat, _ = jax.tree_util.tree_flatten_with_path(rows)
     return {".".join(key.name for key in path): leaf for path, leaf in flat}
 
 
 @functools.cache
 def leaf_specs() -> dict[str, jax.ShapeDtypeStruct]:
-    """Return shape and dtype of one row's leaves by name."""
+    """Returns shape and dtype of one row's leaves by name."""
     return named_leaves(row_spec())
 
 
-def checked_leaves(rows: Demonstration) -> dict[str, np.ndarray]:
-    """Return leaves as contiguous arrays; ValueError if one is not `[n, *spec]`."""
-    leaves = {k: np.ascontiguousarray(v) for k, v in named_leaves(rows).items()}
-    count = leaves["vehicle"].size
-    for name, spec in leaf_specs().items():
-        shape, dtype = (count, *spec.shape), spec.dtype
-        if leaves[name].shape != shape or leaves[name].dtype != dtype:
-            raise ValueError(
-                f"{name}: {leaves[name].dtype} {leaves[name].shape}: "
-                f"expected {dtype} {shape}"
-            )
-    if count == 0:
-        raise ValueError("shard: 0 rows: expected at least one")
-    return leaves
-
-
 def scene_name(rows: Demonstration, at: int, row: int) -> str:
-    """Name a scene in one line: its dataset row and the numbers that it carries.
+    """Names a scene in one line: its dataset row and the numbers that it carries.
 
     Recording and vehicle number the manifest's tables, the frame those of the
     recording.
@@ -104,13 +79,15 @@ def scene_name(rows: Demonstration, at: int, row: int) -> str:
       at: place of the scene among them.
       row: its row in the dataset.
     """
-    number = lambda name: int(np.asarray(getattr(rows, name))[at])  # noqa: E731
-    names = ("recording", "vehicle", "frame")
-    return f"scene {row} ({', '.join(f'{name} {number(name)}' for name in names)})"
+    numbers = ", ".join(
+        f"{name} {int(np.asarray(getattr(rows, name))[at])}"
+        for name in ("recording", "vehicle", "frame")
+    )
+    return f"scene {row} ({numbers})"
 
 
 def unusable_leaves(rows: Demonstration, at: int) -> list[str]:
-    """Return names of a scene's leaves that hold a NaN or an infinity."""
+    """Returns names of a scene's leaves that hold a NaN or an infinity."""
     return [
         name
         for name, leaf in named_leaves(rows).items()
@@ -121,7 +98,7 @@ def unusable_leaves(rows: Demonstration, at: int) -> list[str]:
 def refuse_scenes(
     what: str, rows: Demonstration, index: np.ndarray, bad: Mapping[str, np.ndarray]
 ) -> None:
-    """Refuse scenes of which something is no finite number.
+    """Refuses scenes of which something is no finite number.
 
     Args:
       what: first in the line, who read or made it.
@@ -143,7 +120,7 @@ def refuse_scenes(
 
 
 def check_finite(what: str, rows: Demonstration, index: np.ndarray) -> None:
-    """`refuse_scenes` for what n scenes (numpy) hold themselves, or if n is 0."""
+    """Refuses, as `refuse_scenes`, scenes (numpy) that hold a NaN, or no scene."""
     if len(index) == 0:
         raise InputError(
             f"{what}: 0 scenes: expected at least one; import with test_fraction "

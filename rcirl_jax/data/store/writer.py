@@ -1,34 +1,45 @@
-"""Writing a dataset, shard by shard; the form on disk is `dataset`'s."""
+"""Writing a dataset, shard by shard; the form on disk is `dataset.py`'s."""
 
 import contextlib
-import json
 import os
 import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from rcirl_jax.data.store.dataset import Dataset
-from rcirl_jax.data.store.files import JSON_BYTES, MANIFEST, MARK, SHARDS, Files
-from rcirl_jax.data.store.manifest import (
-    SCHEMA_VERSION,
+import numpy as np
+import tensorstore as ts
+
+from rcirl_jax.data.store.dataset import (
+    Dataset,
     Manifest,
     ShardEntry,
     ShardInfo,
     array_table,
-    describe,
-    encode,
+    layout,
     parse_manifest,
-    seal,
     shard_info,
     shard_key,
     verify_shard,
 )
-from rcirl_jax.data.store.rows import checked_leaves
+from rcirl_jax.data.store.files import (
+    JSON_BYTES,
+    MANIFEST,
+    MARK,
+    SCHEMA_VERSION,
+    SHARDS,
+    Files,
+    describe,
+    seal,
+    unseal,
+)
+from rcirl_jax.data.store.rows import leaf_specs, named_leaves
+from rcirl_jax.data.store.splits import check_disjoint
 from rcirl_jax.errors import InputError, LostWorkError
 from rcirl_jax.types import Demonstration
 from rcirl_jax.units import TIMES_S
 
 SHARDS_END = "shards0"  # first key after all that begin with "shards/"
+ZSTD_LEVEL = 3  # zstd's own default
 
 
 class DatasetWriter:
@@ -39,7 +50,7 @@ class DatasetWriter:
     """
 
     def __init__(self, url: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Look at what is there.
+        """Looks at what is there.
 
         Args:
           url: dataset folder, need not exist, or tensorstore URL.
@@ -66,12 +77,12 @@ class DatasetWriter:
         with contextlib.suppress(InputError):  # of the first shard that is not whole
             while shards and not overwrite:
                 info = verify_shard(self._files, len(self._shards))
-                self._shards.append(_entry(info))
+                self._add(info.count, info.sha256, info.lineage)
         self._first_written: int | None = None
         self._finished = False
 
     def committed(self) -> list[ShardInfo]:
-        """Read the shards already there and whole, from number 0 on without a gap."""
+        """Reads the shards already there and whole, from number 0 on without a gap."""
         return [
             shard_info(self._files, index, shard["sha256"])
             for index, shard in enumerate(self._shards)
@@ -80,7 +91,7 @@ class DatasetWriter:
     def write_shard(
         self, index: int, demonstrations: Demonstration, lineage: list[dict]
     ) -> None:
-        """Write and commit the next shard; removes remains of an earlier attempt.
+        """Writes and commits the next shard; removes remains of an earlier attempt.
 
         Args:
           index: number of the shard, the number of shards before it.
@@ -95,16 +106,28 @@ class DatasetWriter:
         """
         if index != len(self._shards):
             raise ValueError(f"shard {index}: expected {len(self._shards)} next")
-        leaves, key = checked_leaves(demonstrations), shard_key(index)
-        values = {key + file: value for file, value in encode(leaves).items()}
+        leaves = {
+            name: np.ascontiguousarray(leaf)
+            for name, leaf in named_leaves(demonstrations).items()
+        }
+        count = int(leaves["vehicle"].size)
+        for name, spec in leaf_specs().items():
+            found, expected = leaves[name], (count, *spec.shape)
+            if (found.shape, found.dtype) != (expected, spec.dtype) or count == 0:
+                raise ValueError(
+                    f"{name}: {found.dtype} {found.shape}: expected {spec.dtype} "
+                    f"{expected}, at least one row"
+                )
+        key = shard_key(index)
+        values = {key + file: value for file, value in _encode(leaves).items()}
         payload = {
             "schema_version": SCHEMA_VERSION,
             "index": index,
-            "count": int(leaves["vehicle"].size),
+            "count": count,
             "lineage": lineage,
             "files": {k.removeprefix(key): describe(v) for k, v in values.items()},
         }
-        mark = self._readable(seal(payload, "sha256"), key + MARK)
+        mark, sha256 = self._sealed(payload, "sha256", key + MARK)
         if self._first_written is None:
             self._first_written = index
         self._remove_from(index)
@@ -115,17 +138,22 @@ class DatasetWriter:
             if index > 0:
                 raise
             raise InputError(f"{error}: expected a place to write to") from error
-        self._shards.append(_entry(ShardInfo(**json.loads(mark))))
+        self._add(count, sha256, lineage)
 
-    def _readable(self, raw: bytes, key: str) -> bytes:
-        """Refuse to write what would not be read again; what is finished stays."""
-        most = JSON_BYTES[key.rpartition("/")[2]]
-        if len(raw) > most:
+    def _add(self, count: int, sha256: str, lineage: list[dict]) -> None:
+        made_of = {entry["name"]: entry.get("sha256") for entry in lineage}
+        entry: ShardEntry = {"count": count, "sha256": sha256, "recordings": made_of}
+        self._shards.append(entry)
+
+    def _sealed(self, payload: Mapping, field: str, key: str) -> tuple[bytes, str]:
+        """Returns the bytes and digest of a file; refuses what could not be read."""
+        raw, most = seal(payload, field), JSON_BYTES[key.rpartition("/")[2]]
+        if len(raw) > most:  # what is finished stays
             raise LostWorkError(
                 f"{self._files.path(key)}: {len(raw)} bytes of names: expected {most} "
                 "at most; import into several datasets"
             )
-        return raw
+        return raw, unseal(raw, field, key)[field]
 
     def _remove_from(self, index: int) -> None:
         # shards before the manifest: what an interrupt here leaves cannot pass for
@@ -139,7 +167,7 @@ class DatasetWriter:
         manifest_fields: Mapping[str, Any],
         before_commit: Callable[[Dataset], object] = lambda dataset: None,
     ) -> Manifest:
-        """Commit the dataset: check the tables, write manifest.json.
+        """Commits the dataset: checks the tables, writes manifest.json.
 
         Args:
           manifest_fields: the fields of `Manifest` from `rate_hz` on but `shards` and
@@ -161,9 +189,9 @@ class DatasetWriter:
             "time_grid_s": TIMES_S.tolist(),
             "shards": self._shards,
         }
-        raw = self._readable(seal(payload, "hash"), MANIFEST)
+        raw, _ = self._sealed(payload, "hash", MANIFEST)
         dataset = Dataset(self._files, parse_manifest(raw, self._files))
-        dataset.check_tables()
+        _check_tables(dataset)
         self._remove_from(len(self._shards))
         failed = None
         try:
@@ -177,7 +205,7 @@ class DatasetWriter:
         return dataset.manifest
 
     def abort(self) -> None:
-        """Remove what this writer wrote; shards resumed from stay as they were.
+        """Removes what this writer wrote; shards resumed from stay as they were.
 
         Folders made for the dataset go with `Files.alone`.
         """
@@ -189,6 +217,60 @@ class DatasetWriter:
                 os.rmdir(os.path.join(self._files.folder, SHARDS))
 
 
-def _entry(info: ShardInfo) -> ShardEntry:
-    made_of = {entry["name"]: entry.get("sha256") for entry in info.lineage}
-    return {"count": info.count, "sha256": info.sha256, "recordings": made_of}
+def _check_tables(dataset: Dataset) -> None:
+    """Checks numbers against name tables, and that splits share no vehicle."""
+    manifest = dataset.manifest
+    names = {"group": manifest.groups, "vehicle": manifest.vehicles}
+    names |= {"recording": manifest.recordings}
+    columns = dataset.columns(tuple(names), np.arange(dataset.count))
+    for column, table in names.items():
+        low, high = columns[column].min(), columns[column].max()
+        if low < 0 or high >= len(table):
+            raise ValueError(f"{column}: {low} to {high}: {len(table)} names")
+    check_disjoint(columns["group"], columns["vehicle"], dataset.split_groups())
+
+
+def _metadata(shape: tuple[int, ...], dtype: np.dtype) -> dict:
+    """Returns zarr3 metadata: one storage chunk per array, cut into blocks of rows."""
+    block, chunk = map(list, layout(shape))
+    plain = {"name": "bytes", "configuration": {"endian": "little"}}
+    zstd = {"level": ZSTD_LEVEL, "checksum": False}  # crc32c checks already
+    sharding = {
+        "chunk_shape": block,
+        "codecs": [
+            plain if dtype.itemsize > 1 else {"name": "bytes"},
+            {"name": "zstd", "configuration": zstd},
+            {"name": "crc32c"},
+        ],
+        "index_codecs": [plain, {"name": "crc32c"}],
+    }
+    return {
+        "shape": list(shape),
+        "data_type": dtype.name,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunk}},
+        "codecs": [{"name": "sharding_indexed", "configuration": sharding}],
+    }
+
+
+def _encode(leaves: Mapping[str, np.ndarray]) -> dict[str, bytes]:
+    """Returns a shard's zarr3 files by key, made in memory and hashed as written."""
+    context = ts.Context()
+    opened = {
+        name: ts.open(
+            {
+                "driver": "zarr3",
+                "kvstore": {"driver": "memory", "path": f"{name}/"},
+                "metadata": _metadata(leaf.shape, leaf.dtype),
+                "store_data_equal_to_fill_value": True,
+                "create": True,
+            },
+            context=context,
+        )
+        for name, leaf in leaves.items()
+    }
+    writes = [opened[name].result().write(leaf) for name, leaf in leaves.items()]
+    for write in writes:
+        write.result()
+    memory = ts.KvStore.open("memory://", context=context).result()
+    futures = {key: memory.read(key) for key in sorted(memory.list().result())}
+    return {key.decode(): future.result().value for key, future in futures.items()}

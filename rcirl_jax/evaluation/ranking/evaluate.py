@@ -7,7 +7,7 @@ from typing import TypeVar
 import jax
 import numpy as np
 
-from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.data.store.rows import check_finite
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.metrics import (

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import tqdm
 
-from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.score import Scorer
 from rcirl_jax.features import feature_map

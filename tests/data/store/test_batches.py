@@ -17,9 +17,7 @@ from rcirl_jax.data.store.batches import (
     epoch_order,
     split_batches,
 )
-from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.data.store.joined import JoinedDatasets
-from rcirl_jax.data.store.manifest import BLOCK_ROWS
+from rcirl_jax.data.store.dataset import BLOCK_ROWS, JoinedDatasets, open_dataset
 from tests.data.store.test_dataset import make_rows, write
 from tests.helpers.logs import refused
 
@@ -69,7 +67,6 @@ def test_restored_iterator_continues_to_the_bit(count, size, cut):
     [
         ({"batch_size": 0}, "batch_size: 0"),
         ({"batch_size": 5, "num_shards": 2}, "batch_size: 5"),
-        ({"num_shards": 2, "shard_index": 2}, "shard_index: 2"),
         ({"seed": -1}, "seed: -1"),
         ({"indices": np.arange(0)}, "rows: 0"),
     ],
@@ -80,19 +77,12 @@ def test_bad_settings(settings, words):
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"seed": 1}, "seed: 1: expected 0"),
-        ({"position": 2}, "position 2"),
-        ({"position": -1}, "position -1"),
-        ({"epoch": -1}, "epoch -1"),
-    ],
+    "change", [{"seed": 1}, {"position": 2}, {"position": -1}, {"epoch": -1}]
 )
-def test_states_of_other_runs_are_refused(change, words):
+def test_states_of_other_runs_are_refused(change):
     batches = BatchIterator(make_rows(6), batch_size=4, seed=0)
-    assert words in refused(batches.restore, {**batches.state(), **change})
-    line = refused(batches.restore, {"position": 0, "seed": 0})
-    assert "epoch: missing" in line
+    line = refused(batches.restore, {**batches.state(), **change})
+    assert "expected the seed 0 and a position below 2" in line
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ import shutil
 import numpy as np
 import pytest
 
-from rcirl_jax.data.store import manifest
+from rcirl_jax.data.store import files
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.data.store.manifest import describe
+from rcirl_jax.data.store.files import describe
 from tests.data.store.test_dataset import SIZES, write
 from tests.helpers.logs import refused
 
@@ -115,12 +115,12 @@ def reseal(folder, change_shard=None, change=None):
     if change_shard:
         shard.pop("sha256")
         change_shard(shard)
-        mark.write_bytes(manifest.seal(shard, "sha256"))
+        mark.write_bytes(files.seal(shard, "sha256"))
         whole["shards"][0]["sha256"] = json.loads(mark.read_text())["sha256"]
     whole.pop("hash")
     if change:
         change(whole)
-    top.write_bytes(manifest.seal(whole, "hash"))
+    top.write_bytes(files.seal(whole, "hash"))
 
 
 ROWS = "vehicle/c/0"

@@ -297,7 +297,7 @@ def test_a_vehicle_in_two_splits_is_refused(tmp_path):
     ("index", "change", "words"),
     [
         (1, lambda rows: rows, "shard 1: expected 0 next"),
-        (0, lambda rows: jax.tree.map(lambda x: x[:0], rows), "0 rows"),
+        (0, lambda rows: jax.tree.map(lambda x: x[:0], rows), "at least one row"),
         (0, lambda rows: rows.replace(frame=rows.frame.astype(np.int64)),
          r"frame: int64 \(6,\): expected int32"),
         (0, lambda rows: rows.replace(decisions=rows.decisions[:, 1:]),

@@ -5,7 +5,7 @@ import types
 import numpy as np
 import pytest
 
-from rcirl_jax.data.store.resplit import (
+from rcirl_jax.data.store.splits import (
     HOLDOUTS,
     Resplit,
     folds_by_recording,
