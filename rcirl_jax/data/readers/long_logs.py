@@ -1,11 +1,11 @@
 """Logs of rows, by recording; long ones in slices of a minute or less.
 
-A log that fits is held in memory, and each of its recordings is one slice. A long one
-is read once, a few MiB at a time, and its rows are written to scratch files by
-recording and minute. Each minute is then a Recording of its own, with rows before
-and after it, so that scenes and filters do not end at the border. When each road user
-was first seen, also after gaps, is found for the whole log first, so that vehicles and
-their groups are those of a log read at once.
+Rows are sorted into blocks while a log is read, a few MiB at a time. Each recording of
+a log that fits into memory is one block, and one slice. A long log has a block per
+recording and minute, in scratch files. Each minute is then a Recording of its own, with
+rows before and after it, so that scenes and filters do not end at the border. When each
+road user was first seen, also after gaps, is found for the whole log first, so that
+vehicles and their groups are those of a log read at once.
 
 What differs from a file that fits: lanes that are not given are fitted minute by
 minute, the given path is known for 28 s beyond the minute only, and a row out of
@@ -19,8 +19,9 @@ import dataclasses
 import itertools
 import shutil
 import tempfile
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,14 @@ from rcirl_jax.data.readers.tables.rows import (
     drop_position_outliers,
     is_far,
 )
-from rcirl_jax.data.readers.tables.table import Field, Table, batches, read
+from rcirl_jax.data.readers.tables.table import (
+    Batch,
+    Field,
+    Table,
+    batches,
+    check_rows,
+    number_texts,
+)
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import locked
 from rcirl_jax.types import Recording
@@ -104,11 +112,9 @@ def rows_of(
     stats: RowStats,
     *,
     is_long: bool,
-    may_differ: Container[str] = (),
-    places: tuple[str, str] = ("x", "y"),
-    distance: Distance | None = None,
     is_clock: bool = False,
-) -> Iterator["MemoryTable | DiskTable"]:
+    **tidying: Any,  # noqa: ANN401
+) -> Iterator["RowStore"]:
     """Gives the rows of a table, each road user once in a frame.
 
     Args:
@@ -117,182 +123,141 @@ def rows_of(
       stats: of the file.
       is_long: the rows go to scratch files, which are removed afterwards; a bar
         shows the reading.
-      may_differ: columns in which rows may differ that repeat each other.
-      places: columns that say where a road user is.
-      distance: of differences in x and y; places that cannot be reached are then
-        dropped, and an id that goes on elsewhere is seen anew there. None: neither.
       is_clock: t is a time of day, which may go over midnight.
+      **tidying: places, may_differ, distance of `RowStore`.
 
     Raises:
       InputError: no rows, more bad ones than are allowed, or more than MAX_BLOCKS
         minutes.
     """
-    tidy = _Tidy(stats, places, may_differ, distance)
-    if not is_long:
-        yield MemoryTable(read(table, fields, stats), tidy, is_clock)
-        return
-    with scratch() as folder:
-        made = DiskTable(table.path, folder, tidy)
+    with scratch() if is_long else contextlib.nullcontext() as folder:
+        made = RowStore(stats=stats, folder=folder, **tidying)
         with reading(table.path, [table.path]) as show:
+            show = show if is_long else None
             for batch in batches(table, fields, stats, show):
                 made.add(batch)
+                if not is_long:
+                    check_rows(table, stats.read)
         stats.check()
-        made.flush()
-        if is_clock:
-            made.pass_midnight()
+        made.finish(is_clock)
         yield made
 
 
-@dataclasses.dataclass(frozen=True)
-class _Tidy:
-    """How rows are left of which each road user is met once in a frame, and near."""
-
-    stats: RowStats
-    places: tuple[str, str]
-    may_differ: Container[str]
-    distance: Distance | None
-
-    def __call__(self, rows: Rows, names: Sequence[str]) -> Rows:
-        """Returns the rows that are kept; `names` are those of numbered ids."""
-
-        def name_of(user: object) -> str:
-            if names:
-                return names[int(user)]  # pyright: ignore[reportArgumentType]
-            return user if isinstance(user, str) else f"{user:g}"
-
-        rows = drop_duplicates(
-            rows,
-            self.stats,
-            places=self.places,
-            may_differ=self.may_differ,
-            name_of=name_of,
-        )
-        if self.distance is None:
-            return rows
-        return drop_position_outliers(rows, self.stats, self.distance, name_of)
-
-
-class MemoryTable:
-    """Rows by recording, of a log that fits into memory."""
-
-    def __init__(self, rows: Rows, tidy: _Tidy, is_clock: bool) -> None:
-        self._rows, self._tidy, self._is_clock = rows, tidy, is_clock
-        self._of = rows.pop("recording", None)
-        self._tidied: dict[str | None, Rows] = {}
-
-    def recordings(self) -> list[str | None]:
-        """Returns the values of `recording`; [None] without the field."""
-        return [None] if self._of is None else np.unique(self._of).tolist()
-
-    def texts_of(self, field: str) -> list[str]:
-        """Returns all that a field of texts holds."""
-        return np.unique(self._rows.get(field, [])).tolist()
-
-    def minutes(self, recording: str | None) -> Iterator[Rows]:
-        """Yields the rows of a recording, t as in the file."""
-        if recording not in self._tidied:
-            own = self._rows
-            if recording is not None:
-                chosen = self._of == recording
-                own = {name: column[chosen] for name, column in own.items()}
-            if self._is_clock:
-                own = {**own, "t": after_midnight(own["t"])}
-            self._tidied[recording] = self._tidy(own, ())
-        yield self._tidied[recording]
-
-    def slices(self, recording: str | None, max_gap_s: float) -> Iterator[TimeSlice]:
-        """Yields the recording as one slice; arguments as of `DiskTable.slices`."""
-        for values in self.minutes(recording):
-            t = values["t"] - values["t"].min()
-            yield TimeSlice(values={**values, "t": t}, is_whole=True)
-
-
-class DiskTable:
-    """Rows by recording and minute in scratch files of float64.
+@dataclasses.dataclass(kw_only=True)
+class RowStore:
+    """Rows by recording and minute: [n, columns] float64 in memory or scratch files.
 
     Texts are numbers in order of appearance.
     """
 
-    def __init__(self, path: Path, folder: Path, tidy: _Tidy) -> None:
-        self._path, self._folder, self._tidy = path, folder, tidy
-        self._names: list[str] = []  # of the columns, as in the first batch
+    stats: RowStats
+    folder: Path | None  # of scratch files; None: in memory, a recording is one block
+    # columns that say where a road user is
+    places: tuple[str, str] = ("x", "y")
+    # columns in which rows may differ that repeat each other
+    may_differ: Container[str] = ()
+    # of differences in x and y; places that cannot be reached are then dropped, and an
+    # id that goes on elsewhere is seen anew there; None: neither
+    distance: Distance | None = None
+
+    def __post_init__(self) -> None:
+        """Begins without rows."""
+        self._names: list[str] = []  # of the columns
         self._texts: dict[str, dict[str, int]] = {}  # field -> text -> its number
-        self._blocks: dict[int, set[int]] = {}  # number of a recording -> minutes
-        self._buffers: dict[tuple[int, int], list[np.ndarray]] = {}
-        self._held = 0  # bytes in the buffers
+        # number of a recording -> minute -> rows that are in memory
+        self._blocks: dict[int, dict[int, list[np.ndarray]]] = {}
+        self._held = 0  # bytes of them
         self._given = 0.0  # minutes given as slices
         self._tidied: set[int] = set()
+        self._whole: dict[str | None, Rows] = {}  # recordings of one block
         self._arrays: dict[str, np.ndarray] = {}  # field -> all its texts
 
-    def add(self, batch: dict) -> None:
-        """Sorts a batch's rows into their minutes."""
-        if not self._names:
-            self._names = list(batch)
-            self._texts = {n: {} for n in batch if isinstance(batch[n], tuple)}
-        columns = {}
-        for name in self._names:
-            columns[name] = batch[name]
-            if name in self._texts:
-                (codes, texts), known = batch[name], self._texts[name]
-                mine = [known.setdefault(text, len(known)) for text in texts]
-                columns[name] = np.array(mine, np.float64)[codes]
+    def add(self, batch: Batch) -> None:
+        """Sorts a batch's rows into their blocks."""
+        columns = number_texts(batch, self._texts)
+        self._names = list(columns)
         rows = np.stack(list(columns.values()), axis=1)
-        recording = np.zeros(len(rows), np.int64)
+        recording = minute = np.zeros(len(rows), np.int64)
         if "recording" in columns:
             recording = columns["recording"].astype(np.int64)
-        minute = np.floor(columns["t"] / BLOCK_S).astype(np.int64)
+        if self.folder is not None:
+            minute = np.floor(columns["t"] / BLOCK_S).astype(np.int64)
         order = np.lexsort((minute, recording))  # stable: the file's order inside
         keys = np.stack([recording, minute], axis=1)[order]
         changes = np.flatnonzero(np.any(np.diff(keys, axis=0), axis=1)) + 1
         for part in np.split(order, changes) if order.size else []:
-            key = (int(recording[part[0]]), int(minute[part[0]]))
-            self._blocks.setdefault(key[0], set()).add(key[1])
-            self._buffers.setdefault(key, []).append(rows[part])
+            blocks = self._blocks.setdefault(int(recording[part[0]]), {})
+            blocks.setdefault(int(minute[part[0]]), []).append(rows[part])
         if sum(map(len, self._blocks.values())) > MAX_BLOCKS:
             raise InputError(
-                f"{self._path}: t: more than {MAX_BLOCKS} minutes: expected seconds; "
-                "wrong unit of time?"
+                f"{self.stats.path}: t: more than {MAX_BLOCKS} minutes: expected "
+                "seconds; wrong unit of time?"
             )
         self._held += rows.nbytes
-        if self._held > BUFFER_BYTES:
-            self.flush()
+        if self.folder is not None and self._held > BUFFER_BYTES:
+            self._flush()
 
-    def flush(self) -> None:
-        """Writes what is held to the scratch files."""
-        for (recording, minute), rows in self._buffers.items():
-            with (self._folder / f"{recording}_{minute}").open("ab") as file:
-                for part in rows:
-                    file.write(np.ascontiguousarray(part).tobytes())
-        self._buffers, self._held = {}, 0
-
-    def pass_midnight(self) -> None:
-        """Makes minutes after midnight those of the next day."""
-        days = round(DAY_S / BLOCK_S)
-        for code, minutes in self._blocks.items():
+    def finish(self, is_clock: bool) -> None:
+        """Ends the adding; times of day after midnight become those of the next."""
+        if self.folder is not None:
+            self._flush()
+        t, days = self._names.index("t"), round(DAY_S / BLOCK_S)
+        for code, minutes in self._blocks.items() if is_clock else ():
+            if self.folder is None:
+                rows = self._rows(code, 0)
+                rows[:, t] = after_midnight(rows[:, t])
+                self._put(code, 0, rows)
+                continue
             found = np.array(sorted(minutes), float)
             later = after_midnight(found * BLOCK_S) > found * BLOCK_S
             for minute in found[later].astype(int).tolist():
                 rows = self._rows(code, minute)
-                rows[:, self._names.index("t")] += DAY_S
-                (self._folder / f"{code}_{minute}").unlink()
-                rows.tofile(self._folder / f"{code}_{minute + days}")
-                minutes.remove(minute)
-                minutes.add(minute + days)
+                rows[:, t] += DAY_S
+                self._file(code, minute).unlink()
+                del minutes[minute]
+                self._put(code, minute + days, rows)
+
+    def _file(self, code: int, minute: int) -> Path:
+        assert self.folder is not None
+        return self.folder / f"{code}_{minute}"
+
+    def _flush(self) -> None:
+        """Writes what is held to the scratch files."""
+        for code, minutes in self._blocks.items():
+            for minute, parts in minutes.items():
+                if parts:
+                    with self._file(code, minute).open("ab") as file:
+                        for part in parts:
+                            file.write(np.ascontiguousarray(part).tobytes())
+                    parts.clear()
+        self._held = 0
+
+    def _put(self, code: int, minute: int, rows: np.ndarray) -> None:
+        """Replaces a block."""
+        self._blocks[code][minute] = [rows] if self.folder is None else []
+        if self.folder is not None:
+            rows.tofile(self._file(code, minute))
+
+    def _rows(self, code: int, minute: int) -> np.ndarray:
+        parts = self._blocks[code].get(minute)
+        if parts is None:
+            return np.zeros((0, len(self._names)))
+        if self.folder is None:
+            return np.concatenate(parts)
+        raw = np.fromfile(self._file(code, minute), np.float64)
+        return raw.reshape(-1, len(self._names))
 
     def recordings(self) -> list[str | None]:
         """Returns the values of `recording`; [None] without the field."""
-        known = self._texts.get("recording", {})
-        return [text for text, code in known.items() if code in self._blocks] or [None]
+        if "recording" not in self._names:
+            return [None]
+        every = self._texts["recording"].items()
+        found = [text for text, code in every if code in self._blocks]
+        return [*(found if self.folder else sorted(found))]
 
     def texts_of(self, field: str) -> list[str]:
         """Returns all that a field of texts holds."""
         return list(self._texts.get(field, ()))
-
-    def _rows(self, code: int, minute: int) -> np.ndarray:
-        if minute not in self._blocks[code]:
-            return np.zeros((0, len(self._names)))
-        raw = np.fromfile(self._folder / f"{code}_{minute}", np.float64)
-        return raw.reshape(-1, len(self._names))
 
     def _values(self, rows: np.ndarray) -> Rows:
         """Field -> [n], texts as texts."""
@@ -312,26 +277,50 @@ class DiskTable:
         for minute in minutes if code not in self._tidied else ():
             rows = self._rows(code, minute)
             values = {name: rows[:, place] for place, name in enumerate(self._names)}
-            kept = self._tidy(values, self.texts_of("id"))
+            kept = self._tidy(values)
             if kept["t"].size < len(rows):
-                made = np.stack(list(kept.values()), axis=1)
-                made.tofile(self._folder / f"{code}_{minute}")
+                self._put(code, minute, np.stack(list(kept.values()), axis=1))
         self._tidied.add(code)
         return code, minutes
 
+    def _tidy(self, rows: Rows) -> Rows:
+        """Returns rows of which each road user is met once in a frame, and near."""
+        users = self.texts_of("id")
+
+        def name_of(user: float) -> str:
+            return users[int(user)] if users else f"{user:g}"
+
+        kept = drop_duplicates(
+            rows,
+            self.stats,
+            places=self.places,
+            may_differ=self.may_differ,
+            name_of=name_of,
+        )
+        if self.distance is None:
+            return kept
+        return drop_position_outliers(kept, self.stats, self.distance, name_of)
+
     def minutes(self, recording: str | None) -> Iterator[Rows]:
-        """Yields the rows of each minute alone, t as in the file."""
+        """Yields the rows of each block of a recording alone, t as in the file."""
         code, minutes = self._minutes(recording)
-        for minute in minutes:
-            yield self._values(self._rows(code, minute))
+        if self.folder is not None:
+            for minute in minutes:
+                yield self._values(self._rows(code, minute))
+            return
+        if recording not in self._whole:
+            # columns lie in one piece each: all of the log is worked on
+            rows = np.asfortranarray(self._rows(code, 0))
+            self._blocks[code][0] = []
+            self._whole[recording] = self._values(rows)
+        yield self._whole[recording]
 
     def _fragments(
         self, code: int, minutes: list[int], max_gap_s: float
-    ) -> dict[int, list[float]]:
+    ) -> Mapping[int, list[float]]:
         """Number of id -> times [s] at which it is first seen, or again."""
         found: dict[int, list[float]] = {}
-        distance = self._tidy.distance
-        names = ("id", "t", *(self._tidy.places if distance else ()))
+        names = ("id", "t", *(self.places if self.distance else ()))
         columns = [self._names.index(name) for name in names]
         last = np.zeros((0, len(columns)))  # row of each road user so far
         for minute in minutes:
@@ -339,12 +328,11 @@ class DiskTable:
             rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
             steps = np.diff(rows, axis=0)
             same, is_again = steps[:, 0] == 0.0, steps[:, 1] > max_gap_s
-            if distance is not None:
-                is_again |= is_far(steps[:, 1], distance(*steps[:, 2:].T))
+            if self.distance is not None:
+                is_again |= is_far(steps[:, 1], self.distance(*steps[:, 2:].T))
             for user, begin in rows[np.concatenate([[True], ~same]), :2].tolist():
                 found.setdefault(int(user), [begin])
-            again = np.flatnonzero(same & is_again) + 1
-            for user, begin in rows[again, :2].tolist():
+            for user, begin in rows[1:][same & is_again, :2].tolist():
                 found[int(user)].append(begin)
             last = rows[np.concatenate([~same, [True]])]
         return found
@@ -356,6 +344,11 @@ class DiskTable:
           recording: one of `recordings()`.
           max_gap_s: a road user unseen for longer is another fragment.
         """
+        if self.folder is None:
+            for values in self.minutes(recording):
+                t = values["t"] - values["t"].min()
+                yield TimeSlice(values={**values, "t": t}, is_whole=True)
+            return
         code, minutes = self._minutes(recording)
         users = self.texts_of("id")
         t, user = self._names.index("t"), self._names.index("id")

@@ -251,13 +251,11 @@ def test_classes(junction):
 
 
 def test_marked_lanes_longer_than_roads_are_not_made(tmp_path):
-    marks = [";".join(f"{4 * k}" for k in range(a, a + 7)) for a in (0, 7)]
-    cells = {"upperLaneMarkings": marks[0], "lowerLaneMarkings": marks[1]}
-    meta = reader._Meta(path=tmp_path, cells=cells)
+    sides = {"upper": -4.0 * np.arange(7), "lower": -4.0 * np.arange(7, 14)}
 
     def lanes(upper):
         rows = {"x": np.array([0.0, upper]), "y": np.zeros(2), "vx": np.ones(2)}
-        return reader._marked_lanes(tmp_path, meta, rows, None)
+        return reader._marked_lanes(tmp_path, sides, rows, None)
 
     assert len(lanes(400.0)) == 12
     with pytest.raises(InputError, match=r"lanes: 1\.18812e\+07 m long in all"):

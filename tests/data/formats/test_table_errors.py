@@ -20,9 +20,9 @@ WRONG = {
         ("_tracks.csv", "\n1,1,2.58", "\n1,1", "line 2: 24 cells: expected 25"),
         ("_tracksMeta.csv", "class", "type", "column class: missing"),
         ("_tracksMeta.csv", None, None, "input: missing: expected it beside 01_tracks"),
-        ("_recordingMeta.csv", "frameRate", "rate", "frameRate: 'missing'"),
+        ("_recordingMeta.csv", "frameRate", "rate", "column frameRate: missing"),
         ("_recordingMeta.csv", "1,25,", "1,0,", "frameRate: 0: expected 1 to 1000"),
-        ("_recordingMeta.csv", "1,25,2", "1,25", "expected one of 15"),
+        ("_recordingMeta.csv", "1,25,2", "1,25", "14 cells: expected 15"),
         ("_recordingMeta.csv", ",-1.00,", ",fast,", "speedLimit: 'fast': expected a"),
         ("_recordingMeta.csv", None, None, "input: missing: expected it beside 01_"),
         *[
@@ -37,7 +37,7 @@ WRONG = {
         ),
     ],
     "levelx": [
-        ("_recordingMeta.csv", "xUtmOrigin", "xOrigin", "xUtmOrigin: 'missing'"),
+        ("_recordingMeta.csv", "xUtmOrigin", "xOrigin", "column xUtmOrigin: missing"),
         ("_tracksMeta.csv", "0,299,300", "1,300,300", "0: initialFrame: 0: expected 1"),
         ("_tracksMeta.csv", "0,299,300", "0,300,300", "0: finalFrame: 299: expected 3"),
         ("_tracksMeta.csv", "0,299,300", "0,299,299", "0: numFrames: 300: expected 29"),

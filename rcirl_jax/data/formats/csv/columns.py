@@ -30,33 +30,31 @@ from rcirl_jax.data.readers.tables.text import NUMBER
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.checked import check_names
 
-NEEDED = ("t", "id", "x", "y")
-TEXT = ("id", "kind", "lane", "recording", "automated")
-OPTIONAL = (
-    *("heading", "speed", "vx", "vy", "length", "width"),
-    *("kind", "lane", "recording", "automated"),
-)
-EXPECTED = (*NEEDED, "automated")  # errors where they are named and not there
-EARTH = {"lat": "y", "lon": "x"}  # names of x and y in degrees
-CLOCKS = ("s", "ms", "us", "ns", "min", "h", "day", "frame")
 LENGTHS = ("m", "ft", "km", "cm", "mm")
 SPEEDS = ("m/s", "km/h", "mph", "ft/s", "kn")
 ANGLES = ("rad", "deg")
-ALLOWED_UNITS = {
-    "t": (*CLOCKS, ISO),
-    **dict.fromkeys(("x", "y"), (*LENGTHS, *ANGLES)),
-    **dict.fromkeys(("length", "width"), LENGTHS),
-    **dict.fromkeys(("speed", "vx", "vy"), SPEEDS),
-    "heading": ANGLES,
+CLOCKS = ("s", "ms", "us", "ns", "min", "h", "day", "frame", ISO)
+# field of numbers -> its units, and what no log can mean, in the file's unit
+NUMBERS = {
+    "t": (CLOCKS, MAX_TIME),
+    **dict.fromkeys(("x", "y"), ((*LENGTHS, *ANGLES), MAX_PLACE_M)),
+    "heading": (ANGLES, MAX_PLACE_M),
+    **dict.fromkeys(("speed", "vx", "vy"), (SPEEDS, MAX_VELOCITY_MPS)),
+    **dict.fromkeys(("length", "width"), (LENGTHS, math.inf)),
 }
-# in the file's unit: what no log can mean
-LIMITS = {
-    "t": MAX_TIME,
-    **dict.fromkeys(("x", "y"), MAX_PLACE_M),
-    **dict.fromkeys(("speed", "vx", "vy"), MAX_VELOCITY_MPS),
-    "heading": MAX_PLACE_M,
-}
+ALLOWED_UNITS = {field: units for field, (units, _) in NUMBERS.items()}
+TEXT = ("id", "kind", "lane", "recording", "automated")
+NEEDED = ("t", "id", "x", "y")
+OPTIONAL = tuple(field for field in (*NUMBERS, *TEXT) if field not in NEEDED)
+EXPECTED = (*NEEDED, "automated")  # errors where they are named and not there
+EARTH = {"lat": "y", "lon": "x"}  # names of x and y in degrees
 DEGREES = {"x": 360.0, "y": 90.0}  # longitude counts from -180 or from 0
+EARTH_WORDS = {
+    "x": {"lon", "lng", "long", "longitude", "längengrad", "laengengrad"},
+    "y": {"lat", "latitude", "breitengrad"},
+}
+DEGREE_M = 111_320.0  # m of a degree of latitude
+MIDDLE_DIGITS = 2  # of latitude and longitude of the projection's middle
 RATE_HZ = 10.0  # 1/s
 ISO_TIMES = r"\d{4}-\d\d-\d\d[T ]|\d{8}T\d|\d{4}/\d\d/\d\d |\d{1,2}:\d\d"  # as read
 # dates that are neither numbers nor ISO's; the day comes first where both orders fit
@@ -65,13 +63,7 @@ TIMES_OF_DAY = (
     *("%H:%M:%S.%f", "%H:%M:%S,%f", "%H:%M:%S", "%I:%M:%S.%f %p", "%I:%M:%S %p"),
 )
 WORD = r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+"  # of a name in camel case too
-DEGREE_M = 111_320.0  # m of a degree of latitude
-MIDDLE_DIGITS = 2  # of latitude and longitude of the projection's middle
 HOLE = "{id}"  # in a column's name: which road user's it is
-EARTH_WORDS = {
-    "x": {"lon", "lng", "long", "longitude", "längengrad", "laengengrad"},
-    "y": {"lat", "latitude", "breitengrad"},
-}
 Found = list[tuple[str, str, str | None]]  # field, column with its sign, user
 
 
@@ -146,9 +138,9 @@ def _named(
 ) -> tuple[dict[str, str], dict[str, str], list[str]]:
     """(field -> column, field -> unit, notes), latitude and longitude as y and x."""
     columns, units = dict(section(spec, "columns")), dict(section(spec, "units"))
-    where, every = f"{table.path}: columns.", (*NEEDED, *OPTIONAL, *EARTH)
+    where = f"{table.path}: columns."
+    check_names(where, columns, [*NEEDED, *OPTIONAL, *EARTH])
     for field, column in columns.items():
-        check_names(where, {field: column}, every)
         if not isinstance(column, str) or not column:
             raise InputError(f"{where}{field}: {column}: expected a name")
     for name, field in EARTH.items():
@@ -179,15 +171,12 @@ def _named(
     if "x" in units or "y" in units or is_wide:
         return columns, units, []
     for x, y in (("x", "y"), ("y", "x")):  # degrees, by their names and cells
-        cells = {"x": columns[x], "y": columns[y]}
-        if not all(EARTH_WORDS[a] & words_of(cells[a]) for a in "xy"):
-            continue
-        if not all(table.has(name) for name in cells.values()):
-            continue
-        values = {axis: sampled(table, cells[axis]) for axis in "xy"}
-        if all(v.size and np.abs(v).max() <= DEGREES[a] for a, v in values.items()):
-            note = f"columns {columns[x]}, {columns[y]}: longitude and latitude"
-            return {**columns, **cells}, {**units, "x": "deg", "y": "deg"}, [note]
+        own = {"x": columns[x], "y": columns[y]}
+        if all(EARTH_WORDS[a] & words_of(n) and table.has(n) for a, n in own.items()):
+            values = {axis: sampled(table, name) for axis, name in own.items()}
+            if all(v.size and np.abs(v).max() <= DEGREES[a] for a, v in values.items()):
+                note = f"columns {columns[x]}, {columns[y]}: longitude and latitude"
+                return {**columns, **own}, {**units, "x": "deg", "y": "deg"}, [note]
     return columns, units, []
 
 
@@ -216,13 +205,11 @@ def sampled(table: Table, column: str) -> np.ndarray:
 
 def date_pattern(cells: Sequence[str]) -> str:
     """Returns the pattern of strptime that all cells have; "" if none is known."""
-    for date, rest in itertools.product(DATES, TIMES_OF_DAY):
-        pattern = f"{date} {rest}"
+    for parts in itertools.product(DATES, TIMES_OF_DAY) if cells else ():
         with contextlib.suppress(ValueError):
             for cell in cells:
-                datetime.datetime.strptime(cell, pattern)
-            if cells:
-                return pattern
+                datetime.datetime.strptime(cell, " ".join(parts))
+            return " ".join(parts)
     return ""
 
 
@@ -240,28 +227,26 @@ def _middle(
     table: Table, found: Found, degrees: float, spec: Mapping
 ) -> tuple[float, float]:
     """Latitude and longitude [deg] near the first rows, rounded."""
-    places = []
-    for axis in ("y", "x"):
+    places = {}
+    for axis, most in DEGREES.items():
         names = [name.lstrip("-") for field, name, _ in found if field == axis]
         values = np.concatenate([sampled(table, name) for name in names])
         scale, offset = _scaled(axis, spec)
         known = (values[values != 0.0] * scale + offset) * degrees
-        known = known[np.abs(known) <= DEGREES[axis]]
+        known = known[np.abs(known) <= most]
         if axis == "x" and known.size:  # 179.9 and -179.9 are near each other
             known = known[0] + (known - known[0] + 180.0) % 360.0 - 180.0
-        places.append(
-            round(float(np.median(known)), MIDDLE_DIGITS) if known.size else 0.0
-        )
-    return places[0], (places[1] + 180.0) % 360.0 - 180.0
+        middle = float(np.median(known)) if known.size else 0.0
+        places[axis] = round(middle, MIDDLE_DIGITS)
+    return places["y"], (places["x"] + 180.0) % 360.0 - 180.0
 
 
 def _check_units(table: Table, spec: Mapping, units: dict[str, str]) -> None:
     """Units are known; scales and offsets are numbers of fields that have a unit."""
-    fields = (*ALLOWED_UNITS, *EARTH)
-    scaled = {name: section(spec, name) for name in ("scale", "offset")}
-    for name, own in {"units": units, **scaled}.items():
-        known = ALLOWED_UNITS if name == "units" else fields
-        check_names(f"{table.path}: {name}.", own, [*known])
+    check_names(f"{table.path}: units.", units, [*NUMBERS])
+    for name in ("scale", "offset"):
+        own = section(spec, name)
+        check_names(f"{table.path}: {name}.", own, [*NUMBERS, *EARTH])
     for field, unit in units.items():
         is_pattern = field == "t" and "%" in str(unit)
         if unit not in ALLOWED_UNITS[field] and not is_pattern:
@@ -269,30 +254,29 @@ def _check_units(table: Table, spec: Mapping, units: dict[str, str]) -> None:
                 f"{table.path}: units.{field}: {unit}: "
                 f"expected one of {', '.join(ALLOWED_UNITS[field])}"
             )
-    if (units.get("x") in ANGLES) != (units.get("y") in ANGLES):
+    x, y = (units.get(axis, "m") for axis in "xy")
+    if (x in ANGLES) != (y in ANGLES):
         raise InputError(
-            f"{table.path}: units.x, units.y: {units.get('x', 'm')} and "
-            f"{units.get('y', 'm')}: expected both in degrees or both in metres"
+            f"{table.path}: units.x, units.y: {x} and {y}: expected both in degrees or "
+            "both in metres"
         )
 
 
 def _found(table: Table, columns: Mapping[str, str], notes: list[str]) -> Found:
     """All columns that are there; notes on those that are not."""
     found: Found = []
-    is_wide = HOLE in columns.get("x", "")
-    users = _users(table, columns) if is_wide else []
-    if not is_wide:
-        needed = [columns[field] for field in NEEDED]
-        is_log = any(table.has(name.lstrip("-")) for name in needed)
-        # without a header that names any, the missing column is named below
-        if not is_log and not any(NUMBER.fullmatch(name) for name in table.header):
-            raise InputError(
-                f"{table.path}: header: {[*table.header[:20]]}: none of the columns "
-                f"{', '.join(needed)}: expected a log; `pattern` of the TOML leaves "
-                "out tables that are none"
-            )
+    users = _users(table, columns) if HOLE in columns.get("x", "") else []
+    needed = [columns.get(field, "") for field in NEEDED]
+    is_log = users or any(table.has(name.lstrip("-")) for name in needed)
+    # without a header that names any, the missing column is named below
+    if not is_log and not any(NUMBER.fullmatch(name) for name in table.header):
+        raise InputError(
+            f"{table.path}: header: {[*table.header[:20]]}: none of the columns "
+            f"{', '.join(needed)}: expected a log; `pattern` of the TOML leaves "
+            "out tables that are none"
+        )
     for field, name in columns.items():
-        plain = name.removeprefix("-") if field not in TEXT else name
+        plain = _plain(field, name)
         sign = name[: len(name) - len(plain)]
         for user in users if HOLE in name else [None]:
             column = plain if user is None else plain.replace(HOLE, user)
@@ -305,17 +289,20 @@ def _found(table: Table, columns: Mapping[str, str], notes: list[str]) -> Found:
     return found
 
 
+def _plain(field: str, name: str) -> str:
+    """Name of a column; "-name" turns an axis round."""
+    return name if field in TEXT else name.removeprefix("-")
+
+
 def _users(table: Table, columns: Mapping[str, str]) -> list[str]:
     """Road users that have both an x and a y in a row per frame."""
     own = []
     for field in ("x", "y"):
-        name = columns[field].removeprefix("-")
-        before, _, after = name.partition(HOLE)
-        pattern = re.compile(f"{re.escape(before)}(.+){re.escape(after)}")
-        matches = (pattern.fullmatch(column) for column in table.header)
+        ends = map(re.escape, _plain(field, columns[field]).split(HOLE, 1))
+        pattern = re.compile("(.+)".join(ends))
+        matches = map(pattern.fullmatch, table.header)
         own.append([match[1] for match in matches if match])
-    both = set(own[1])
-    users = [user for user in own[0] if user in both]
+    users = [user for user in own[0] if user in own[1]]
     if not users:
         raise InputError(
             f"{table.path}: columns.x: {columns['x']}: expected columns of this name "
@@ -328,22 +315,21 @@ def _time(
     table: Table, name: str, unit: str | None, rate: float, notes: list[str]
 ) -> tuple[str, float]:
     """(form, factor) of the clock; where nothing is said, as its first cells are."""
-    cells = known_cells(table, name)
-    first = next(iter(cells), "")
-    is_iso = re.match(ISO_TIMES, first) is not None
-    pattern = "" if is_iso else date_pattern(cells)
-    if unit is None and (is_iso or pattern):
-        said = "ISO times" if is_iso else f"times as {pattern}"
-        notes.append(f"column {name}: {said}")
-        return pattern or ISO, 1.0
     if unit == ISO or (unit is not None and "%" in unit):
         return unit, 1.0
-    if is_iso or pattern:
+    first, form = first_cell(table, name), ISO
+    if not re.match(ISO_TIMES, first):
+        form = date_pattern(known_cells(table, name))
+    if not form:
+        return "", 1.0 / rate if unit == "frame" else UNITS[unit or "s"]
+    if unit is not None:
         raise InputError(
             f"{table.path}: units.t: {unit}: the cells of {name} are such as "
-            f"'{first[:40]}': expected {pattern or ISO}"
+            f"'{first[:40]}': expected {form}"
         )
-    return "", 1.0 / rate if unit == "frame" else UNITS[unit or "s"]
+    said = "ISO times" if form == ISO else f"times as {form}"
+    notes.append(f"column {name}: {said}")
+    return form, 1.0
 
 
 def _field(
@@ -355,13 +341,13 @@ def _field(
     form: str,
     clock: float,
 ) -> Field:
-    """One column as the reader takes it; "-name" turns an axis round."""
-    plain = name.removeprefix("-") if field not in TEXT else name
-    scale, offset = _scaled(field, spec)
-    unit, limit, factor = units.get(field, ""), LIMITS.get(field, np.inf), 1.0
+    """One column as the reader takes it."""
+    plain, (scale, offset) = _plain(field, name), _scaled(field, spec)
+    unit, factor = units.get(field, ""), 1.0
+    limit = NUMBERS[field][1] if field in NUMBERS else math.inf
     is_place_on_earth = unit in ANGLES and field in DEGREES
     if field == "t":
-        limit, factor = math.inf if form else LIMITS["t"] / min(clock, 1.0), clock
+        limit, factor = math.inf if form else limit / min(clock, 1.0), clock
     elif is_place_on_earth:
         limit = DEGREES[field] * (UNITS["deg"] if unit == "rad" else 1.0)
     elif unit in UNITS and field != "heading":

@@ -43,7 +43,13 @@ from rcirl_jax.data.formats.csv.reader import PATTERNS, opened
 from rcirl_jax.data.formats.files import table_stem
 from rcirl_jax.data.formats.options import KINDS, UNITS
 from rcirl_jax.data.readers.tables.rows import LINE, Rows
-from rcirl_jax.data.readers.tables.table import MAX_TIME, Table, batches, open_table
+from rcirl_jax.data.readers.tables.table import (
+    MAX_TIME,
+    Table,
+    as_texts,
+    batches,
+    open_table,
+)
 from rcirl_jax.data.readers.tables.text import NUMBER
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.runtime.specs import load_toml, spec_root
@@ -158,10 +164,7 @@ def _first_rows(path: Path, spec: Mapping) -> Rows:
     log = opened(path, dict(spec))
     for batch in batches(log.table, log.columns.fields, log.stats):
         if batch[LINE].size:
-            return {
-                name: np.array(c[1])[c[0]] if isinstance(c, tuple) else c
-                for name, c in batch.items()
-            }
+            return as_texts(log.table, batch)
     log.stats.check()
     raise InputError(f"{path}: rows: none: expected rows below the header")
 

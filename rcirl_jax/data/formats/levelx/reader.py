@@ -36,7 +36,6 @@ from rcirl_jax.data.formats.projection import utm, utm_zone
 from rcirl_jax.data.formats.tracks import split_tracks
 from rcirl_jax.data.readers.tables.rows import Rows, RowStats, attach_row_stats
 from rcirl_jax.data.readers.tables.table import (
-    MAX_PLACE_M,
     Table,
     fields_of,
     open_table,
@@ -54,6 +53,8 @@ NEEDED = {
 VELOCITY = {"vx": "xVelocity", "vy": "yVelocity"}
 CORNER = {"length": "width", "width": "height", **VELOCITY}  # highD's columns
 CENTRE = {"id": "trackId", "x": "xCenter", "y": "yCenter", **VELOCITY}
+# of the map's frame, in recordingMeta
+ORIGIN = {"lonLocation": "longitude", "xUtmOrigin": "place", "yUtmOrigin": "place"}
 LIFE = ("numFrames", "initialFrame", "finalFrame")  # of a track, in tracksMeta
 MAX_GAP_FRAMES = 5.5  # frames missing inside one track
 MAX_ID = 2**53  # beyond it float64 does not count
@@ -72,26 +73,6 @@ class _User:
     kind: str  # class in lower case
     direction: float  # highD's drivingDirection, 1 towards -x; else 0
     life: tuple[float, float, float]  # its LIFE
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Meta:
-    """The one row of a recordingMeta.csv, as text."""
-
-    path: Path
-    cells: Mapping[str, str]
-
-    def number(self, field: str, limit: float = np.inf) -> float:
-        """Returns a number, finite and within a limit."""
-        try:
-            value = float(self.cells.get(field, "nan"))
-        except ValueError:
-            value = float("nan")
-        if not (np.isfinite(value) and abs(value) <= limit):
-            found = self.cells.get(field, "missing")[:40]
-            kind = "finite number" if limit == np.inf else f"number within {limit:g}"
-            raise InputError(f"{self.path}: {field}: '{found}': expected a {kind}")
-        return value
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
@@ -131,14 +112,14 @@ def _recording(table: Table, spec: dict, stats: RowStats) -> Recording:
     rows = read_log(table, stats, needed, columns=columns, **options)
     direction = "drivingDirection" if is_corner else None
     users = _read_users(_beside(path, USERS), columns.get("id", "id"), direction)
-    meta = _read_meta(_beside(path, META))
-    rate = meta.number("frameRate")
+    # semicolons stand inside of cells
+    about = open_table(_beside(path, META), {"delimiter": ","})
+    meta = _read_meta(about, {} if is_corner else ORIGIN)
+    rate = meta["frameRate"]
     if not 1.0 <= rate <= 1000.0:
-        raise InputError(f"{meta.path}: frameRate: {rate:g}: expected 1 to 1000 1/s")
-    limit = None
-    if meta.cells.get("speedLimit", "").lower() not in ("", "nan"):
-        found = meta.number("speedLimit")
-        limit = found if found > 0.0 else None  # -1 stands for none
+        raise InputError(f"{about.path}: frameRate: {rate:g}: expected 1 to 1000 1/s")
+    limit = meta.get("speedLimit", np.nan)
+    limit = float(limit) if limit > 0.0 else None  # -1 stands for none
     rows["t"] = (rows["frame"] - rows["frame"].min()) / rate
     rows["speed"] = np.hypot(rows["vx"], rows["vy"])
     if is_corner:
@@ -146,7 +127,7 @@ def _recording(table: Table, spec: dict, stats: RowStats) -> Recording:
         rows["y"] = -(rows["y"] + 0.5 * rows["width"])
     else:
         rows["heading"] = np.deg2rad(rows["heading"])
-    ids = _ids(path, rows, users, spec)
+    ids = _ids(path, rows, users)
     tracks = [
         _track(name, {n: rows[n][part] for n in rows}, users[int(ids[part[0]])], spec)
         for name, part in split_tracks(path, ids, rows["frame"], MAX_GAP_FRAMES)
@@ -154,16 +135,16 @@ def _recording(table: Table, spec: dict, stats: RowStats) -> Recording:
     if not spec.get("partial", False):
         _check_whole(path, ids, rows["frame"], users)
     if is_corner:
-        lanes, notes = _marked_lanes(path, meta, rows, limit), []
+        sides = {side: _markings(about, f"{side}LaneMarkings") for side in SIDES}
+        lanes, notes = _marked_lanes(path, sides, rows, limit), []
     else:
-        lanes, notes = _mapped_lanes(path, meta, tracks, spec)
+        lanes, notes = _mapped_lanes(about, meta, tracks, spec)
     met = set(ids.tolist())
     missing = len(set(users) - met)
     notes += [f"{missing} tracks of tracksMeta have no rows"] if missing else []
     notes += unknown_kinds("classes", {user.kind for user in users.values()})
     if trailers := sum(users[number].kind == "trailer" for number in met):
         notes += [f"{trailers} trailers are obstacles of kind cyclist, no experts"]
-    default = number(spec, "default_speed_limit")
     return Recording(
         name=log_name(path, spec, own_name(path)),
         source=spec["source"],
@@ -171,9 +152,20 @@ def _recording(table: Table, spec: dict, stats: RowStats) -> Recording:
         rate_hz=rate,
         tracks=tuple(tracks),
         lanes=lanes,
-        default_speed_limit=limit if limit is not None else default,
+        default_speed_limit=limit or number(spec, "default_speed_limit"),
         notes=tuple(notes),
     )
+
+
+def _read_meta(table: Table, origin: Mapping[str, str]) -> dict[str, float]:
+    """The numbers of the one row of a recordingMeta.csv."""
+    fields = fields_of(
+        table, {"frameRate": "number", **origin}, {"speedLimit": "number"}
+    )
+    rows = read(table, fields, RowStats(path=table.path, allowed=0.0))
+    if rows["frameRate"].size != 1:
+        raise InputError(f"{table.path}: rows: several: expected one")
+    return {name: float(column[0]) for name, column in rows.items()}
 
 
 def _track(name: str, rows: Rows, user: _User, spec: dict) -> Track:
@@ -186,18 +178,6 @@ def _track(name: str, rows: Rows, user: _User, spec: dict) -> Track:
         standing = float(heading[0])
         del rows["heading"]
     return track_of(name, rows, kind, usual, standing=standing)
-
-
-def _read_meta(path: Path) -> _Meta:
-    table = open_table(path, {"delimiter": ","})  # semicolons stand inside of cells
-    sizes = [len(row) for row in table.head]
-    if sizes != [len(table.header)]:
-        raise InputError(
-            f"{path}: rows: {len(sizes)} of {sizes[:3]} cells: "
-            f"expected one of {len(table.header)}"
-        )
-    texts = map(str.strip, table.head[0])
-    return _Meta(path=path, cells=dict(zip(table.header, texts, strict=True)))
 
 
 def _read_users(path: Path, key: str, direction: str | None) -> dict[int, _User]:
@@ -219,7 +199,7 @@ def _read_users(path: Path, key: str, direction: str | None) -> dict[int, _User]
     }
 
 
-def _ids(path: Path, rows: Rows, users: dict[int, _User], spec: dict) -> np.ndarray:
+def _ids(path: Path, rows: Rows, users: dict[int, _User]) -> np.ndarray:
     """Track numbers [n], each of which tracksMeta knows."""
     names = rows["id"]
     wrong = np.flatnonzero((names != np.round(names)) | (np.abs(names) > MAX_ID))
@@ -257,17 +237,16 @@ def _check_whole(
 
 
 def _marked_lanes(
-    path: Path, meta: _Meta, rows: Rows, limit: float | None
+    path: Path, sides: Mapping[str, np.ndarray], rows: Rows, limit: float | None
 ) -> tuple[Lane, ...]:
     """highD: straight lanes between the markings, named as `laneId` names them.
 
-    A carriageway is driven the way its rows are.
+    A carriageway (`sides`, `_markings` of each) is driven the way its rows are.
     """
     check_span(str(path), "x", rows["x"])
     lower, upper = float(rows["x"].min()), float(rows["x"].max())
-    sides = {side: _markings(meta, f"{side}LaneMarkings") for side in SIDES}
     count = sum(marks.size - 1 for marks in sides.values())
-    check_lanes_length(str(meta.path), count * (upper - lower + 2.0 * MARGIN_M))
+    check_lanes_length(str(path), count * (upper - lower + 2.0 * MARGIN_M))
     lanes: list[Lane] = []
     first = 2  # lane 1 lies above the first marking
     for side, marks in sides.items():
@@ -291,31 +270,30 @@ def _marked_lanes(
     return tuple(lanes)
 
 
-def _markings(meta: _Meta, field: str) -> np.ndarray:
+def _markings(table: Table, field: str) -> np.ndarray:
     """[m] m, y of the markings from top to bottom (y up)."""
-    text = meta.cells.get(field, "")
+    (text,) = table.samples(field) or [""]
     try:
         marks = -np.array([float(mark) for mark in text.split(";") if mark.strip()])
     except ValueError:
         marks = np.zeros(0)
     if marks.size < 2 or not np.isfinite(marks).all() or np.any(np.diff(marks) >= 0.0):
         raise InputError(
-            f"{meta.path}: {field}: '{text[:60]}': expected at least two increasing "
+            f"{table.path}: {field}: '{text[:60]}': expected at least two increasing "
             "numbers separated by ;"
         )
     return marks
 
 
 def _mapped_lanes(
-    path: Path, meta: _Meta, tracks: list[Track], spec: dict
+    table: Table, meta: Mapping[str, float], tracks: list[Track], spec: dict
 ) -> tuple[tuple[Lane, ...], list[str]]:
     """Lanes of the location's Lanelet2 map; else fitted to the paths driven."""
-    place = _find_map(path, meta.cells.get("locationId", ""), spec)
-    why = "no map found"
+    location = table.samples("locationId") if table.has("locationId") else [""]
+    place, why = _find_map(table.path, location[0], spec), "no map found"
     if place is not None:
-        zone = utm_zone(meta.number("lonLocation", 180.0))
-        fields = ("xUtmOrigin", "yUtmOrigin")
-        origin = np.array([meta.number(field, MAX_PLACE_M) for field in fields])
+        zone = utm_zone(meta["lonLocation"])
+        origin = np.array([meta["xUtmOrigin"], meta["yUtmOrigin"]])
         lanes, notes = read_lanelet2(place, lambda a, b: utm(a, b, zone) - origin)
         middle = [np.median([np.median(getattr(t, c)) for t in tracks]) for c in "xy"]
         apart = (float(np.min(np.hypot(*(ln.centre - middle).T))) for ln in lanes)

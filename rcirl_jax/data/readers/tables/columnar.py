@@ -33,11 +33,8 @@ def columns_of(path: Path) -> list[str]:
       InputError: a damaged file, or more columns than tables have.
     """
     with _opened(path) as file:
-        schema = file.schema_arrow if hasattr(file, "schema_arrow") else file.schema
-        if len(schema) > MAX_COLUMNS:
-            raise InputError(
-                f"{path}: columns: {len(schema)}: expected at most {MAX_COLUMNS}"
-            )
+        schema = getattr(file, "schema_arrow", None) or file.schema
+        _check(path, "columns", len(schema), MAX_COLUMNS)
         return list(schema.names)
 
 
@@ -48,12 +45,18 @@ def columnar_batches(path: Path, names: Sequence[str]) -> Iterator[tuple[list, f
       InputError: a damaged file, or a row group too large to be held.
     """
     is_parquet = first_bytes(path).startswith(PARQUET)
-    read = _parquet_batches if is_parquet else _feather_batches
-    with _one_line(path):
-        for batch, share in read(path, list(dict.fromkeys(names))):
+    wanted = list(dict.fromkeys(names))
+    for batch, share in (_parquet if is_parquet else _feather)(path, wanted):
+        with _one_line(path):
             # indices and text of a damaged page, which reading does not check
             batch.validate(full=True)
-            yield [batch.column(name) for name in names], share
+        yield [batch.column(name) for name in names], share
+
+
+def _check(path: Path, what: str, found: int, most: int) -> None:
+    """Refuses what would fill the memory."""
+    if found > most:
+        raise InputError(f"{path}: {what}: {found}: expected at most {most}")
 
 
 @contextlib.contextmanager
@@ -65,13 +68,8 @@ def _one_line(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except (
-        arrow.ArrowException,
-        OSError,
-        ValueError,
-        TypeError,
-        LookupError,
-        MemoryError,
-        OverflowError,
+        *(arrow.ArrowException, OSError, ValueError, TypeError),
+        *(LookupError, MemoryError, OverflowError),
     ) as error:
         kind = "Parquet" if first_bytes(path).startswith(PARQUET) else "Feather"
         why = " ".join(str(error).split())[:200]
@@ -103,15 +101,12 @@ def _opened(path: Path, words: Sequence[str] = (), places: Any = None) -> Iterat
             yield file
 
 
-def _parquet_batches(path: Path, names: Sequence[str]) -> Iterator[tuple[Any, float]]:
+def _parquet(path: Path, names: Sequence[str]) -> Iterator[tuple[Any, float]]:
     types = extra_module("pyarrow").types
     with _opened(path) as file:
         found = file.metadata
         words = [n for n in names if types.is_string(file.schema_arrow.field(n).type)]
-        if found.num_columns > MAX_COLUMNS:
-            raise InputError(
-                f"{path}: columns: {found.num_columns}: expected at most {MAX_COLUMNS}"
-            )
+        _check(path, "columns", found.num_columns, MAX_COLUMNS)
         groups = [found.row_group(i) for i in range(found.num_row_groups)]
         counts = [found.num_rows, *(group.num_rows for group in groups)]
         if min(counts) < 0 or max(counts) > MAX_ROWS or sum(counts[1:]) != counts[0]:
@@ -121,11 +116,7 @@ def _parquet_batches(path: Path, names: Sequence[str]) -> Iterator[tuple[Any, fl
             )
         # not the sizes of single columns: pyarrow aborts the process over damaged ones
         largest = max((group.total_byte_size for group in groups), default=0)
-        if largest > MAX_GROUP_BYTES:
-            raise InputError(
-                f"{path}: row group: {largest} bytes: expected at most "
-                f"{MAX_GROUP_BYTES}"
-            )
+        _check(path, "row group: bytes", largest, MAX_GROUP_BYTES)
     with _opened(path, words) as file:
         done, total = 0, max(file.metadata.num_rows, 1)
         for batch in file.iter_batches(BATCH_ROWS, columns=names, use_threads=False):
@@ -133,15 +124,11 @@ def _parquet_batches(path: Path, names: Sequence[str]) -> Iterator[tuple[Any, fl
             yield batch, done / total
 
 
-def _feather_batches(path: Path, names: Sequence[str]) -> Iterator[tuple[Any, float]]:
+def _feather(path: Path, names: Sequence[str]) -> Iterator[tuple[Any, float]]:
     with _opened(path) as file:
         places = [file.schema.get_field_index(name) for name in names]
     with _opened(path, places=places) as file:
         for number in range(file.num_record_batches):
             whole = file.get_batch(number)
-            if whole.nbytes > MAX_GROUP_BYTES:
-                raise InputError(
-                    f"{path}: batch {number}: {whole.nbytes} bytes: expected at most "
-                    f"{MAX_GROUP_BYTES}"
-                )
+            _check(path, f"batch {number}: bytes", whole.nbytes, MAX_GROUP_BYTES)
             yield whole, (number + 1) / file.num_record_batches

@@ -5,6 +5,7 @@ places at once or far from its track. `RowStats` counts them, and refuses a file
 many.
 """
 
+import collections
 import dataclasses
 from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
@@ -55,7 +56,7 @@ class RowStats:
     doubled: int = 0  # a road user that is met twice in one frame
     first: str = ""  # what is wrong with the first bad row
     firsts: dict[str, str] = dataclasses.field(default_factory=dict)  # of `news`
-    reported: RowCounts = dataclasses.field(default_factory=RowCounts)
+    reported: dict[str, int] = dataclasses.field(default_factory=dict)
 
     def drop(self, why: str, first: str, count: int = 1) -> None:
         """Counts dropped rows; `first` says what is wrong with the first of them."""
@@ -75,38 +76,38 @@ class RowStats:
                 f"expected up to {100.0 * self.allowed:g} % (max_bad_rows of the TOML)"
             )
 
-    def news(self) -> tuple[RowCounts, list[str]]:
+    def news(self) -> tuple[collections.Counter[str], list[str]]:
         """Returns what was counted since the last call, also as notes."""
-        names = [field.name for field in dataclasses.fields(RowCounts)]
-        since = {n: getattr(self, n) - getattr(self.reported, n) for n in names}
+        counts = {name: getattr(self, name) for name in ("read", *NOTES)}
+        since = collections.Counter(counts)
+        since.subtract(self.reported)
+        self.reported = counts
         notes = [
             f"{since[why]} {what.format(first=self.firsts.pop(why))}"
             for why, what in NOTES.items()
             if since[why]
         ]
-        self.reported = RowCounts(**{name: getattr(self, name) for name in names})
-        return RowCounts(**since), notes
+        return since, notes
 
 
 def attach_row_stats(made: Recording, *files: RowStats) -> Recording:
     """Adds to a recording what became of its files' rows since the one before it."""
-    found = [stats.news() for stats in files]
-    names = [field.name for field in dataclasses.fields(RowCounts)]
-    counts = {name: sum(getattr(rows, name) for rows, _ in found) for name in names}
-    notes = [note for _, dropped in found for note in dropped]
-    return dataclasses.replace(
-        made, rows=RowCounts(**counts), notes=(*made.notes, *notes)
-    )
+    counts, notes = collections.Counter[str](), [*made.notes]
+    for stats in files:
+        since, dropped = stats.news()
+        counts.update(since)
+        notes += dropped
+    return dataclasses.replace(made, rows=RowCounts(**counts), notes=tuple(notes))
 
 
 def allowed_share(spec: Mapping) -> float:
     """Returns the option `max_bad_rows` of a source TOML."""
     value = spec.get("max_bad_rows", MAX_BAD_ROWS)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"source TOML: max_bad_rows: {value}: expected a number")
-    if not 0.0 <= value < 1.0:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not 0.0 <= value < 1.0:
         raise InputError(
-            f"source TOML: max_bad_rows: {value:g}: expected a share from 0 to below 1"
+            f"source TOML: max_bad_rows: {f'{value:g}' if is_number else value}: "
+            "expected a share from 0 to below 1"
         )
     return float(value)
 
@@ -144,17 +145,21 @@ def drop_duplicates(
     codes = ids if ids.dtype.kind == "f" else np.unique(ids, return_inverse=True)[1]
 
     def is_again(order: np.ndarray) -> np.ndarray:
+        """Whether each but the first row is of the user and frame of the one before."""
         return (np.diff(codes[order]) == 0) & (np.diff(clock[order]) == 0.0)
 
-    def named(row: int) -> str:
-        return f"{stats.unit} {rows[LINE][row]:.0f}: id {name_of(ids[row])}"
+    def drop(why: str, found: np.ndarray, what: str) -> None:
+        if found.size:
+            row = found.min()
+            line = f"{stats.unit} {rows[LINE][row]:.0f}: id {name_of(ids[row])}"
+            stats.drop(why, f"{line}: {what}", found.size)
 
     kept = np.ones(clock.size, bool)
     order = np.lexsort((clock, codes))  # stable: the file's order inside
     same = is_again(order)
     if not same.any():
         return rows
-    shared = order[np.concatenate([same, [False]]) | np.concatenate([[False], same])]
+    shared = order[np.append(same, False) | np.append(False, same)]
     columns = [
         np.unique(rows[name][shared], return_inverse=True)[1]
         for name in rows
@@ -165,33 +170,27 @@ def drop_duplicates(
     equal = np.all([np.diff(column[inner]) == 0 for column in columns], axis=0)
     repeats = shared[inner[1:][equal]]
     kept[repeats] = False
-    if repeats.size:
-        first = f"{named(repeats.min())}: the same row again"
-        stats.drop("repeated", first, repeats.size)
+    drop("repeated", repeats, "the same row again")
     order = order[kept[order]]
     same = is_again(order)
-    if same.any():
-        first = f"{named(order[1:][same].min())}: met twice in one frame"
-        stats.drop("doubled", first, int(same.sum()))
+    drop("doubled", order[1:][same], "met twice in one frame")
     stats.check()
     none = np.zeros(clock.size)
     where = np.stack([rows.get(name, none) for name in places])
-    starts = np.flatnonzero(np.concatenate([[True], ~same]))
+    starts = np.flatnonzero(np.append(True, ~same))
     ends = np.append(starts[1:], order.size)
     several = ends - starts > 1
     for low, high in zip(starts[several], ends[several], strict=True):
-        doubles, near = order[low:high], None
+        doubles, chosen = order[low:high], 0
         kept[doubles] = False
-        before = low - 1
-        while before >= 0 and not kept[order[before]]:
+        before = low
+        while before and not kept[order[before - 1]]:
             before -= 1
-        if before >= 0 and codes[order[before]] == codes[doubles[0]]:
-            near = order[before]
-        elif high < order.size and codes[order[high]] == codes[doubles[0]]:
-            near = order[high]
-        chosen = 0
-        if near is not None:
-            chosen = np.argmin(np.hypot(*(where[:, doubles] - where[:, [near]])))
+        beside = order[max(before - 1, 0) : before], order[high : high + 1]
+        for near in np.concatenate(beside):
+            if codes[near] == codes[doubles[0]]:
+                chosen = np.argmin(np.hypot(*(where[:, doubles] - where[:, [near]])))
+                break
         kept[doubles[chosen]] = True
     return {name: column[kept] for name, column in rows.items()}
 
@@ -232,14 +231,12 @@ def drop_position_outliers(
         far = same & is_far(np.diff(t[at]), distance(np.diff(x[at]), np.diff(y[at])))
         if not far.any() or far.sum() > MOST_FAR * same.sum():
             break
-        starts = np.flatnonzero(np.concatenate([[True], ~same | far]))
+        starts = np.flatnonzero(np.append(True, ~same | far))
         ends = np.append(starts[1:], at.size)
         cut = np.concatenate([[False], far, [False]])  # far from the row before
-        alone = np.stack([cut[starts], cut[ends]])
-        alone = alone.all(axis=0) if is_amid else alone.any(axis=0)
-        spikes = (ends - starts <= SPIKE_ROWS) & alone
-        for low, high in zip(starts[spikes], ends[spikes], strict=True):
-            kept[at[low:high]] = False
+        alone = cut[starts] & cut[ends] if is_amid else cut[starts] | cut[ends]
+        sizes = ends - starts
+        kept[at] &= ~np.repeat(alone & (sizes <= SPIKE_ROWS), sizes)
     dropped = order[~kept]
     if not dropped.size:
         return rows

@@ -20,11 +20,8 @@ MAX_SPAN = 20  # lines of one row, by line ends inside of quotes
 HEAD_LINES = 60  # lines from which a layout is recognised
 HEAD_BYTES = 2**16  # bytes from which an encoding is recognised
 MIN_ASCII = 0.2  # share of a head's characters; another encoding has fewer
-PACKED = {
-    b"\x1f\x8b": "gzip",
-    b"\x28\xb5\x2f\xfd": "zstd",
-    b"BZh": "bz2",
-}  # first bytes -> pyarrow's name
+# first bytes -> pyarrow's name of what packs a file
+PACKED = {b"\x1f\x8b": "gzip", b"\x28\xb5\x2f\xfd": "zstd", b"BZh": "bz2"}
 # first bytes -> what a file is that is no table, and what to do
 NO_TABLES = {
     b"PK\x03\x04": "a spreadsheet or a zip archive: expected a table; export it as "
@@ -33,12 +30,12 @@ NO_TABLES = {
     b"SQLite format 3": "a database: expected a table; export it as CSV",
 }
 POINTER = b"version https://git-lfs.github.com/spec/"
-BYTE_ORDERS = (
-    (codecs.BOM_UTF8, "utf-8-sig"),
-    (codecs.BOM_UTF32_LE, "utf-32"),
-    (codecs.BOM_UTF16_LE, "utf-16"),
-    (codecs.BOM_UTF16_BE, "utf-16"),
-)  # first bytes -> encoding
+BYTE_ORDERS = {
+    codecs.BOM_UTF8: "utf-8-sig",
+    codecs.BOM_UTF32_LE: "utf-32",
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+}  # first bytes -> encoding, the longer first
 
 
 def first_bytes(path: Path, count: int = 64) -> bytes:
@@ -64,9 +61,7 @@ def refuse_pointer(path: Path) -> None:
 def packing(path: Path) -> str | None:
     """Returns what packs a file, by its first bytes; None: nothing known."""
     head = first_bytes(path)
-    return next(
-        (name for first, name in PACKED.items() if head.startswith(first)), None
-    )
+    return next((name for mark, name in PACKED.items() if head.startswith(mark)), None)
 
 
 @contextlib.contextmanager
@@ -77,11 +72,10 @@ def unpacked(path: Path) -> Iterator[tuple[Any, IO[bytes]]]:
       InputError: a damaged archive, a Git LFS pointer, a spreadsheet.
     """
     refuse_pointer(path)
-    head = first_bytes(path)
-    for first, what in NO_TABLES.items():
-        if head.startswith(first):
+    head, packed = first_bytes(path), packing(path)
+    for mark, what in NO_TABLES.items():
+        if head.startswith(mark):
             raise InputError(f"{path}: {what}")
-    packed = packing(path)
     with path.open("rb") as file:
         if packed is None:
             yield file, file
@@ -119,12 +113,10 @@ def _text(path: Path, encoding: str) -> Iterator[tuple[io.TextIOWrapper, IO[byte
             made.detach()
 
 
-def _line(path: Path, text: io.TextIOWrapper, ends_early: bool = False) -> str:
-    """The next line, "" at the end; or, if asked for, instead of one too long."""
+def _line(path: Path, text: io.TextIOWrapper) -> str:
+    """The next line, "" at the end."""
     line = text.readline(MAX_LINE + 1)
     if len(line) > MAX_LINE:
-        if ends_early:
-            return ""
         raise InputError(
             f"{path}: a line of more than {MAX_LINE} characters: expected one a row"
         )
@@ -147,11 +139,12 @@ def head_of(path: Path, encoding: str = "") -> tuple[str, list[str]]:
     lines: list[str] = []
     with _text(path, encoding) as (text, _):
         while len(lines) < HEAD_LINES and sum(map(len, lines)) <= MAX_LINE:
-            if not (line := _line(path, text, ends_early=bool(lines))):
+            line = text.readline(MAX_LINE + 1) if lines else _line(path, text)
+            if not line or len(line) > MAX_LINE:
                 break
             lines.append(line)
     some = "".join(lines)[:HEAD_BYTES]
-    if not any(line.strip() for line in lines):
+    if not some.strip():
         raise InputError(f"{path}: rows: none: expected a header and rows")
     if sum(map(str.isascii, some)) < MIN_ASCII * len(some):  # digits are
         raise InputError(
@@ -162,13 +155,13 @@ def head_of(path: Path, encoding: str = "") -> tuple[str, list[str]]:
 
 def _recognised(path: Path, data: bytes) -> str:
     """Returns the encoding of a text by its first bytes."""
-    for mark, name in BYTE_ORDERS:
+    for mark, name in BYTE_ORDERS.items():
         if data.startswith(mark):
             return name
     # of letters, digits and commas every other byte is 0
     for first, name in ((1, "utf-16-le"), (0, "utf-16-be")):
-        zeros = data[first::2].count(0), data[1 - first :: 2].count(0)
-        if zeros[0] > 0.4 * len(data) and zeros[1] < 0.05 * len(data):
+        zeros, others = data[first::2].count(0), data[1 - first :: 2].count(0)
+        if zeros > 0.4 * len(data) and others < 0.05 * len(data):
             return name
     try:
         codecs.getincrementaldecoder("utf-8")().decode(data)
@@ -197,8 +190,8 @@ def blocks(
     with _text(path, encoding) as (text, file):
         while True:
             parts = [text.read(READ_CHARS), _line(path, text)]
-            odd = sum(part.count(quote) for part in parts) % 2 if quote else 0
-            for _ in range(MAX_SPAN if odd else 0):
+            is_open = quote and sum(part.count(quote) for part in parts) % 2
+            for _ in range(MAX_SPAN if is_open else 0):
                 parts.append(_line(path, text))
                 if parts[-1].count(quote) % 2:
                     break

@@ -40,8 +40,13 @@ MAX_VELOCITY_MPS = 1e4  # m/s; keeps squares finite, recording.py has the true l
 MAX_TIME = 1e14  # s, ms or frames; ms since 1970 are 2e12
 LIMITS = {
     **{"time": MAX_TIME, "place": MAX_PLACE_M, "speed": MAX_VELOCITY_MPS},
+    "longitude": 180.0,
     **{"count": 1e12, "number": np.inf, "text": np.inf},
 }  # what cells are -> beyond it no log means anything, in the file's unit
+
+
+# field -> [n], of texts (codes [n], names), of which several may be equal
+Batch = dict[str, Any]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -197,8 +202,8 @@ def batches(
     fields: Sequence[Field],
     stats: RowStats,
     show: Callable[[int], object] | None = None,
-) -> Iterator[dict[str, Any]]:
-    """Yields columns of a few MiB of rows; texts as (codes, names).
+) -> Iterator[Batch]:
+    """Yields the readable rows of a few MiB in SI units.
 
     Args:
       table: of `open_table`.
@@ -212,10 +217,11 @@ def batches(
     places = [table.place(field.column) for field in fields]
     if table.layout is not None:
         for made in text_batches(table.path, table.layout, places, show):
-            for line, why in made.unreadable:
+            columns, lines, unreadable = made
+            for line, why in unreadable:
                 stats.drop("unreadable", f"line {line}: {why}")
-            stats.read += len(made.unreadable)
-            yield _batch(table, fields, made.columns, made.lines, stats)
+            stats.read += len(unreadable)
+            yield _batch(table, fields, columns, lines, stats)
         return
     done, size, last = 0, table.path.stat().st_size, 0.0
     names = [table.header[place] for place in places]
@@ -237,12 +243,7 @@ class _Column:
     values: np.ndarray  # [n] numbers in the file's unit, or codes of names
     names: list[str] | None
     empty: np.ndarray  # [n]
-    wrong: np.ndarray  # [n] unreadable, or absurd
-
-    @property
-    def bad(self) -> np.ndarray:
-        """Whether a row [n] cannot be used for this cell."""
-        return self.wrong | (self.empty & self.field.needed)
+    bad: np.ndarray  # [n] unreadable, absurd, or empty and needed
 
     def complaint(self, row: int) -> str:
         """Says what is wrong with the cell of a row."""
@@ -253,7 +254,7 @@ class _Column:
         expected = f"a time as {field.form}" if field.form else "a finite number"
         if self.names is not None:
             long = f"up to {cells.TEXT_CHARS} characters"
-            expected = long if self.wrong[row] else "a text"
+            expected = "a text" if self.empty[row] else long
         elif np.isfinite(value) and abs(value) > field.limit:
             shown, expected = f"{value:g}", f"within {field.limit:g}"
         return f"{field.column}: {shown}: expected {expected}"
@@ -261,12 +262,11 @@ class _Column:
 
 def _column(table: Table, field: Field, found: Any) -> _Column:  # noqa: ANN401
     """Cells as numbers or texts, still with those that cannot be read."""
+    names = None
     try:
         if field.text:
-            codes, names, wrong = cells.texts(found, field.lower)
-            empty = np.array([not name for name in names], bool)[codes]
-            return _Column(field, found, codes, names, empty, wrong)
-        if field.form:
+            values, names, wrong = cells.texts(found, field.lower)
+        elif field.form:
             values, wrong = cells.times(found, field.form)
         else:
             marks = table.marks(field.column) if cells.is_texts(found) else (".", "")
@@ -274,11 +274,14 @@ def _column(table: Table, field: Field, found: Any) -> _Column:  # noqa: ANN401
     except (TypeError, extra_module("pyarrow").ArrowException) as error:
         why = " ".join(str(error).split())[:200]
         raise InputError(f"{table.path}: column {field.column}: {why}") from error
-    if field.scale != 1.0 or field.offset:
-        values = values * field.scale + field.offset
-    wrong = wrong | (np.abs(values) > field.limit)
-    empty = (np.isnan(values) & ~wrong) | (field.zero_is_empty & (values == 0.0))
-    return _Column(field, found, values, None, empty, wrong)
+    if names is not None:
+        empty = np.array([not name for name in names], bool)[values]
+    else:
+        if field.scale != 1.0 or field.offset:
+            values = values * field.scale + field.offset
+        wrong = wrong | (np.abs(values) > field.limit)
+        empty = (np.isnan(values) & ~wrong) | (field.zero_is_empty & (values == 0.0))
+    return _Column(field, found, values, names, empty, wrong | (empty & field.needed))
 
 
 def _batch(
@@ -287,64 +290,96 @@ def _batch(
     found: Sequence[Any],
     lines: np.ndarray,
     stats: RowStats,
-) -> dict[str, Any]:
+) -> Batch:
     """A batch's readable rows in SI units, of all users below each other.
 
-    Rows without anything but a time are none at all.
+    Rows without anything but a time are none at all. What a user has no column for is
+    unknown.
     """
     made = [_column(table, *pair) for pair in zip(fields, found, strict=True)]
     users = list(dict.fromkeys(field.user for field in fields if field.user))
     parts = []
     for number, user in enumerate(users or [None]):
-        columns = [c for c in made if c.field.user in (None, user)]
+        columns = {c.field.name: c for c in made if c.field.user in (None, user)}
         own = [
-            c.empty for c in columns if c.field.needed and c.field.name not in COMMON
+            column.empty
+            for name, column in columns.items()
+            if column.field.needed and name not in COMMON
         ]
         blank = np.all(own, axis=0) if len(own) > 1 else np.zeros(lines.size, bool)
-        bad = np.any([column.bad for column in columns], axis=0)
-        dropped = bad & ~blank
+        bad = np.any([column.bad for column in columns.values()], axis=0)
+        dropped, rows = bad & ~blank, ~bad & ~blank
         stats.read += int(np.sum(~blank))
         if dropped.any():
             row = int(np.argmax(dropped))
-            first = next(column for column in columns if column.bad[row])
+            first = next(column for column in columns.values() if column.bad[row])
             why = f"{table.unit} {lines[row]}: {first.complaint(row)}"
             stats.drop("unreadable", why, int(dropped.sum()))
-        rows = ~bad & ~blank
-        part: dict[str, Any] = {LINE: lines[rows]}
-        for column in columns:
-            values = column.values[rows]
-            part[column.field.name] = (
-                values * column.field.factor
-                if column.names is None
-                else (values, column.names)
-            )
+        count = int(rows.sum())
+        part: Batch = {LINE: lines[rows]}
+        for field in fields:
+            column = columns.get(field.name)
+            if field.text:
+                codes = (
+                    np.zeros(count, np.int64) if column is None else column.values[rows]
+                )
+                part[field.name] = codes, [""] if column is None else column.names
+            elif column is None:
+                part[field.name] = np.full(count, np.nan)
+            else:
+                part[field.name] = column.values[rows] * column.field.factor
         if users:
-            part["id"] = np.full(int(rows.sum()), number), users
+            part["id"] = np.full(count, number), users
         parts.append(part)
-    return parts[0] if len(parts) == 1 else _below_each_other(parts)
+    return _below_each_other(parts)
 
 
-def _below_each_other(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Batches of the same fields as one; a column that some lack is unknown there."""
-    made: dict[str, Any] = {}
-    for name in dict.fromkeys(name for part in parts for name in part):
-        columns = [part.get(name) for part in parts]
-        sizes = [part[LINE].size for part in parts]
-        if not any(isinstance(column, tuple) for column in columns):
-            filled = [
-                np.full(size, np.nan) if column is None else column
-                for size, column in zip(sizes, columns, strict=True)
+def _below_each_other(parts: Sequence[Batch]) -> Batch:
+    """Batches of the same fields as one; names of texts stand behind each other."""
+    if len(parts) == 1:
+        return parts[0]
+    made: Batch = {}
+    for name in parts[0] if parts else ():
+        columns = [part[name] for part in parts]
+        if isinstance(columns[0], tuple):
+            starts = np.cumsum([0, *(len(names) for _, names in columns)])
+            codes = [
+                own + start for (own, _), start in zip(columns, starts, strict=False)
             ]
-            made[name] = np.concatenate(filled)
-            continue
-        known: dict[str, int] = {}
-        every = []
-        for size, column in zip(sizes, columns, strict=True):
-            codes, names = column or (np.zeros(size, np.int64), [""])
-            mine = [known.setdefault(text, len(known)) for text in names]
-            every.append(np.array(mine, np.int32)[codes])
-        made[name] = np.concatenate(every), list(known)
+            names = [text for _, names in columns for text in names]
+            made[name] = np.concatenate(codes), names
+        else:
+            made[name] = np.concatenate(columns)
     return made
+
+
+def number_texts(batch: Batch, known: dict[str, dict[str, int]]) -> Rows:
+    """Returns a batch whose texts are numbers: those of `known`, which grows.
+
+    Args:
+      batch: of `batches`.
+      known: field -> text -> its number, in order of appearance.
+    """
+    made = dict(batch)
+    for name, column in batch.items():
+        if isinstance(column, tuple):
+            codes, texts = column
+            own = known.setdefault(name, {})
+            is_met = np.bincount(codes, minlength=len(texts)) > 0
+            numbers = [
+                own.setdefault(text, len(own)) if is_used else 0
+                for text, is_used in zip(texts, is_met.tolist(), strict=True)
+            ]
+            made[name] = np.array(numbers, np.float64)[codes]
+    return made
+
+
+def check_rows(table: Table, count: int) -> None:
+    """Refuses a table of more rows than are held at once."""
+    if count > MAX_ROWS:
+        raise InputError(
+            f"{table.path}: rows: more than {MAX_ROWS}: expected fewer; {CUT_IT}"
+        )
 
 
 def read(table: Table, fields: Sequence[Field], stats: RowStats) -> Rows:
@@ -360,24 +395,29 @@ def read(table: Table, fields: Sequence[Field], stats: RowStats) -> Rows:
             f"{table.path}: size: {size >> 20} MiB: expected {MAX_BYTES >> 20} at "
             f"most; {CUT_IT}"
         )
-    parts, rows = [], 0
+    parts = []
     for batch in batches(table, fields, stats):
         parts.append(batch)
-        rows += batch[LINE].size
-        if rows > MAX_ROWS:
-            raise InputError(
-                f"{table.path}: rows: more than {MAX_ROWS}: expected fewer; {CUT_IT}"
-            )
+        check_rows(table, stats.read)
     stats.check()
-    whole = _below_each_other(parts)
-    for name, column in whole.items():
+    return as_texts(table, _below_each_other(parts))
+
+
+def as_texts(table: Table, batch: Batch) -> Rows:
+    """Returns a batch with its texts themselves.
+
+    Raises:
+      InputError: one text is so long that all of them would fill the memory.
+    """
+    made = dict(batch)
+    for name, column in batch.items():
         if isinstance(column, tuple):
             codes, names = column
-            longest = max(map(len, names))
+            longest, rows = max(map(len, names)), codes.size
             if 4 * longest * rows > MAX_BYTES:  # numpy gives all cells as much room
                 raise InputError(
                     f"{table.path}: {name}: {rows} rows of texts up to {longest} "
                     f"characters: expected {MAX_BYTES >> 20} MiB at most; {CUT_IT}"
                 )
-            whole[name] = np.array(names)[codes]
-    return whole
+            made[name] = np.array(names)[codes]
+    return made

@@ -29,7 +29,6 @@ from rcirl_jax.errors import InputError, extra_module
 from rcirl_jax.runtime.checked import check_names
 
 MAX_COLUMNS = 10_000  # of a table; logs have some dozens
-PACKED_ROWS = 2**13  # that are held as lists of cells
 MOST = 0.8  # share of a head's rows that repeat their last columns
 SAMPLE_CELLS = 20_000  # cells of the head from which decimals are recognised
 DELIMITERS = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";", "pipe": "|"}
@@ -45,12 +44,29 @@ EMPTY = (
 MARKED = frozenset(GROUPS) - {"."}
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
-MARKS = {
-    "decimal": (".", ","),
-    "thousands": (*GROUPS, ""),
-    "quote": ('"', "'", ""),
+
+
+def _one_of(*allowed: str) -> tuple[str, Callable[[Any], bool]]:
+    return f"one of {' '.join(allowed)}", lambda value: value in allowed
+
+
+def _is_delimiter(value: str) -> bool:
+    is_mark = len(value) == 1 and value in string.punctuation + " \t"
+    return value in DELIMITERS or is_mark
+
+
+COUNT = "a number of lines or columns", range(MAX_COLUMNS + 1).__contains__
+# [table] of a source TOML: option -> its type, what is expected, whether a value is it
+OPTIONS: dict[str, tuple[type, str, Callable[[Any], bool]]] = {
+    "delimiter": (str, f"one of {', '.join(DELIMITERS)}, or a mark", _is_delimiter),
+    "decimal": (str, *_one_of(".", ",")),
+    "thousands": (str, *_one_of(*GROUPS, "")),
+    "quote": (str, *_one_of('"', "'", "")),
+    "encoding": (str, "a text", lambda _: True),
+    "skip": (int, *COUNT),
+    "names": (list, "a list of names", lambda v: all(isinstance(n, str) for n in v)),
+    "repeating": (int, *COUNT),
 }
-OPTIONS = ("delimiter", *MARKS, "encoding", "skip", "names", "repeating")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,19 +125,21 @@ def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
     has_header = len(cells) > 1 and not any(
         NUMBER.fullmatch(cell.strip(" \"'")) for cell in cells
     )
-    lines = [
-        line if line[:1] not in HASHES else ("" if has_header else line.lstrip("#% "))
-        for line in lines
-    ]
+    for at, line in enumerate(lines):
+        if line[:1] in HASHES:
+            lines[at] = "" if has_header else line.lstrip("#% ")
     # double quotes; single ones where they enclose cells and no others do
     text, single = "\n".join(lines), r"(^|[,;\t|])'[^'\n]*'([,;\t|]|$)"
     is_single = '"' not in text and re.search(single, text, re.M)
     quote = given.get("quote", "'" if is_single else '"')
     delimiter = given.get("delimiter") or _delimiter(lines, quote)
     rows = cells_of(lines, delimiter, quote)
-    if "names" in given:
-        header, first = given["names"], given.get("skip", 0)
-    else:
+    header, first, has_names = (
+        given.get("names"),
+        given.get("skip", 0),
+        "names" in given,
+    )
+    if header is None:
         at = min(given.get("skip", _header_line(rows)), len(rows) - 1)
         header, first = [name.strip() for name in rows[at]], at + 1
     if not any(header):
@@ -131,9 +149,9 @@ def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
             f"{path}: header: {len(header)} columns: expected up to {MAX_COLUMNS}"
         )
     below = [row for row in rows[first:] if any(cell.strip() for cell in row)]
-    units: Sequence[str] = ()
-    if "names" not in given and _are_units(below, len(header)):
-        units, first, below = below[0], first + 1, below[1:]
+    units: list[str] = []
+    if not has_names and _are_units(below, len(header)):
+        units, first, below = [cell.strip() for cell in below[0]], first + 1, below[1:]
     repeating = given.get("repeating", _repeating(len(header), below))
     if repeating > len(header):
         raise InputError(
@@ -141,12 +159,8 @@ def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
             "number of columns"
         )
     # rows with names: each has a cell more than the header, and no empty last one
-    if (
-        not repeating
-        and "names" not in given
-        and below
-        and all(len(row) == len(header) + 1 and row[-1].strip() for row in below)
-    ):
+    more = {len(row) - len(header) if row[-1].strip() else 0 for row in below}
+    if more == {1} and not (repeating or has_names):
         header = ["", *header]
     decimal, thousands = decimal_of(below, delimiter)
     layout = Layout(
@@ -157,7 +171,7 @@ def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
         thousands=given.get("thousands", thousands),
         skip=first,
         header=tuple(header),
-        units=tuple(unit.strip() for unit in units),
+        units=tuple(units),
         repeating=repeating,
     )
     return layout, below
@@ -169,31 +183,18 @@ def _options(path: Path, section: Mapping) -> dict[str, Any]:
     Raises:
       InputError: an unknown option, or one of another form.
     """
-    found: dict[str, Any] = {}
-    check_names(f"{path}: table.", section, OPTIONS)
+    check_names(f"{path}: table.", section, [*OPTIONS])
     for name, value in section.items():
-        expected, is_right = "a text", isinstance(value, str)
-        if name in ("skip", "repeating"):
-            expected = "a number of lines or columns"
-            is_right = type(value) is int and 0 <= value <= MAX_COLUMNS
-        elif name == "names":
-            expected = "a list of names"
-            is_right = isinstance(value, list) and all(
-                isinstance(one, str) for one in value
+        kind, expected, is_right = OPTIONS[name]
+        if type(value) is not kind or not is_right(value):
+            is_text = kind is not str or isinstance(value, str)
+            raise InputError(
+                f"{path}: table.{name}: {value}: expected "
+                f"{expected if is_text else 'a text'}"
             )
-        elif is_right and name == "delimiter":
-            expected = f"one of {', '.join(DELIMITERS)}, or a mark"
-            value = DELIMITERS.get(value) or value
-            is_right = value == "\t" or (
-                len(value) == 1 and value in string.punctuation + " "
-            )
-        elif is_right and name in MARKS:
-            expected = f"one of {' '.join(MARKS[name])}"
-            is_right = value in MARKS[name]
-        if not is_right:
-            where = f"{path}: table.{name}: {section[name]}"
-            raise InputError(f"{where}: expected {expected}")
-        found[name] = value
+    found = dict(section)
+    if "delimiter" in found:
+        found["delimiter"] = DELIMITERS.get(found["delimiter"], found["delimiter"])
     if found.get("decimal") and found.get("decimal") == found.get("thousands"):
         raise InputError(f"{path}: table.thousands: expected another than the decimal")
     return found
@@ -242,9 +243,7 @@ def _delimiter(lines: Sequence[str], quote: str) -> str:
     best, most = BLANKS, (0.0, 0)
     for mark in TRIED:
         counts = [len(row) for row in cells_of(lines, mark, quote)]
-        width, times = max(
-            collections.Counter(counts).items(), key=lambda item: (item[1], item[0])
-        )
+        width, times = _most_common(counts)
         if width == 1 and counts[0] > 1:  # rows of different lengths
             width, times = counts[0], 1
         if width > 1 and (times / len(counts), width) > most:
@@ -263,25 +262,23 @@ def _header_line(rows: Sequence[Sequence[str]]) -> int:
 
     Empty cells at the ends of lines count, or not. The first one if all are empty.
     """
-    wholes = [len(row) for row in rows]
-    filled = [len(_trimmed(row)) for row in rows]
-    if not any(filled):
-        return 0
-    wanted = {_usual(wholes, filled), _usual(filled, filled)} - {0}
-    for at, counts in enumerate(zip(wholes, filled, strict=True)):
-        if counts[1] > 1 and any(c in (w, w - 1) for c in counts for w in wanted):
+    wholes, filled = [len(row) for row in rows], [len(_trimmed(row)) for row in rows]
+    wanted = set()
+    for counts in (wholes, filled):
+        known = [count for count, some in zip(counts, filled, strict=True) if some]
+        usual, times = _most_common(known) if known else (0, 0)
+        wanted |= {usual, usual - 1} if times > 1 else set()
+    for at, (whole, some) in enumerate(zip(wholes, filled, strict=True)):
+        if some > 1 and not wanted.isdisjoint((whole, some)):
             return at
-    several = (at for at, count in enumerate(filled) if count > 1)
-    return next(several, next(at for at, count in enumerate(filled) if count))
+    several = (at for least in (1, 0) for at, n in enumerate(filled) if n > least)
+    return next(several, 0)
 
 
-def _usual(counts: Sequence[int], filled: Sequence[int]) -> int:
-    """What most lines count that are not empty; 0: each another number."""
-    known = [count for count, some in zip(counts, filled, strict=True) if some]
-    usual, times = max(
-        collections.Counter(known).items(), key=lambda item: (item[1], item[0])
-    )
-    return usual if times > 1 else 0
+def _most_common(counts: Sequence[int]) -> tuple[int, int]:
+    """The number met most often, the larger of two, and how often it is met."""
+    found = collections.Counter(counts)
+    return max(found.items(), key=lambda item: (item[1], item[0]))
 
 
 def _repeating(width: int, rows: Sequence[Sequence[str]]) -> int:
@@ -328,13 +325,9 @@ def decimal_of(rows: Sequence[Sequence[str]], delimiter: str) -> tuple[str, str]
     return decimal, ""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TextBatch:
-    """A few MiB of rows."""
-
-    columns: list[Any]  # pyarrow's text arrays [n], of the columns asked for
-    lines: np.ndarray  # [n] int64, of each row
-    unreadable: list[tuple[int, str]]  # line and what is wrong with it
+# pyarrow's text arrays [n] of the columns asked for, line [n] of each row, and
+# (line, what is wrong with it) of rows that cannot be read
+TextBatch = tuple[list[Any], np.ndarray, list[tuple[int, str]]]
 
 
 def text_batches(
@@ -369,17 +362,16 @@ def text_batches(
         first, lines = start + above, text.count("\n") + (not text.endswith("\n"))
         columns = None if layout.repeating else _columns_of(text, layout, places)
         if columns is not None and len(columns[0]) == lines:
-            numbers = np.arange(first, first + lines)
-            yield TextBatch(columns=columns, lines=numbers, unreadable=[])
+            yield columns, np.arange(first, first + lines), []
             continue
-        made = _row_by_row(text, first, layout, places)
-        bad = made.unreadable[-1:]
+        columns, numbers, unreadable = _row_by_row(text, first, layout, places)
+        bad = unreadable[-1:]
         if not text.endswith("\n") and bad and bad[0][0] == first + lines - 1:
             raise InputError(
                 f"{path}: line {bad[0][0]}: {bad[0][1]}; the last line breaks off: "
                 "expected a whole file"
             )
-        yield made
+        yield columns, numbers, unreadable
 
 
 def _columns_of(text: str, layout: Layout, places: Sequence[int]) -> list[Any] | None:
@@ -421,15 +413,7 @@ def _row_by_row(
 ) -> TextBatch:
     """Returns columns of rows of which some are none, repeat, or take several lines."""
     width, fixed = len(layout.header), len(layout.header) - layout.repeating
-    arrow = extra_module("pyarrow")
-    parts: list[list[Any]] = [[] for _ in places]  # arrays take less room than lists
-    rows: list[list[str]] = []
-
-    def pack() -> None:
-        for k, arrays in enumerate(parts):
-            arrays.append(arrow.array([row[k] for row in rows], arrow.string()))
-        rows.clear()
-
+    columns: list[list[str]] = [[] for _ in places]
     numbers: list[int] = []
     unreadable: list[tuple[int, str]] = []
     every, at = text.removesuffix("\n").split("\n"), 0
@@ -443,10 +427,9 @@ def _row_by_row(
             unreadable.append((number, "a quote without an end"))
         if not line.strip():
             continue
-        (cells,) = cells_of([line], layout.delimiter, layout.quote)
-        made = [cells]
+        made = cells_of([line], layout.delimiter, layout.quote)
         if layout.repeating:
-            cells = _trimmed([cell.strip() for cell in cells])
+            cells = _trimmed([cell.strip() for cell in made[0]])
             groups = range(fixed, len(cells), layout.repeating)
             made = [
                 [*cells[:fixed], *cells[k : k + layout.repeating]] for k in groups
@@ -454,19 +437,15 @@ def _row_by_row(
         for row in made:
             while len(row) > width and not row[-1].strip():
                 row.pop()
-            if len(row) == width:
-                rows.append([row[place] for place in places])
-                if len(rows) >= PACKED_ROWS:
-                    pack()
-                numbers.append(number)
-            else:
+            if len(row) != width:
                 unreadable.append((number, f"{len(row)} cells: expected {width}"))
-    pack()
-    return TextBatch(
-        columns=[arrow.concat_arrays(arrays) for arrays in parts],
-        lines=np.array(numbers, np.int64),
-        unreadable=unreadable,
-    )
+                continue
+            numbers.append(number)
+            for column, place in zip(columns, places, strict=True):
+                column.append(row[place])
+    arrow = extra_module("pyarrow")
+    arrays = [arrow.array(column, arrow.string()) for column in columns]
+    return arrays, np.array(numbers, np.int64), unreadable
 
 
 def _span(lines: Sequence[str], layout: Layout) -> int:
