@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.importing import digest
-from rcirl_jax.errors import InputError
 from tests.data.formats import writers as w
 from tests.helpers import logs
 
@@ -55,17 +54,12 @@ def test_lanes_are_numbered_from_the_left(tmp_path):
     assert second.centre[0, 0] == pytest.approx(fronts.min() - 50.0)
     assert second.centre[-1, 0] == pytest.approx(fronts.max() + 50.0)
     assert second.speed_limit == 29.06
-
-
-def test_bounds_lie_midway_between_unequal_lanes(tmp_path):
+    # bounds lie midway between unequal lanes; ramps at one place are no neighbours
     _, middle, last = lanes_at(tmp_path, {1: 6.0, 2: 18.0, 3: 31.0})
     np.testing.assert_allclose(middle.left_width, 6.0 * w.FOOT)
     np.testing.assert_allclose(middle.right_width, 6.5 * w.FOOT)
     np.testing.assert_allclose(last.left_width, 6.5 * w.FOOT)
     np.testing.assert_allclose(last.right_width, 0.5 * LANE_M)
-
-
-def test_ramps_at_one_place_are_no_neighbours(tmp_path):
     lanes = lanes_at(tmp_path, {1: 6.0, 7: 78.0, 8: 79.0})
     assert all(lane.left is None and lane.right is None for lane in lanes)
 
@@ -96,16 +90,20 @@ def test_gaps_split_a_vehicle(tmp_path):
 
 
 def test_csv_is_the_same_as_text(tmp_path):
+    """Its columns in any order and case; also numbers as spreadsheets write them."""
     rows = w.ngsim_rows() + w.ngsim_rows(vehicle=2, local_x=30.0, lane=3)
-    text = only(w.ngsim_text(tmp_path / "a.txt", rows))
+    text = digest(only(w.ngsim_text(tmp_path / "a.txt", rows)))
     order = np.random.default_rng(0).permutation(len(w.NGSIM_COLUMNS))
     columns = [w.NGSIM_COLUMNS[i].upper() for i in order]
     shuffled = [[row[i] for i in order] for row in rows]
-    table = only(w.ngsim_csv(tmp_path / "a.csv", shuffled, columns=columns))
-    for one, other in zip(text.tracks, table.tracks, strict=True):
-        np.testing.assert_allclose(one.x, other.x)
-        np.testing.assert_allclose(one.y, other.y)
-        assert (one.id, one.length, one.width) == (other.id, other.length, other.width)
+    table = w.ngsim_csv(tmp_path / "a.csv", shuffled, columns=columns)
+    assert digest(only(table)) == text
+    # the interface of the portal gives what was asked for; 0 is the class of nobody
+    kept = (0, 1, 5, 11, 13)
+    columns = [w.NGSIM_COLUMNS[i] for i in kept]
+    rows = [[row[i] for i in kept] for row in w.ngsim_rows()]
+    (track,) = only(w.ngsim_csv(tmp_path / "a.csv", rows, columns=columns)).tracks
+    assert (track.length, track.width) == (4.5, 1.8)
 
 
 def stamped(rows, begin=8e11):
@@ -134,14 +132,6 @@ def periods():
     return rows
 
 
-def test_columns_chosen_in_the_portal(tmp_path):
-    """Downloads by its interface hold what was asked for; 0 is the class of nobody."""
-    columns = [w.NGSIM_COLUMNS[i] for i in (0, 1, 5, 11, 13)]
-    rows = [[row[i] for i in (0, 1, 5, 11, 13)] for row in w.ngsim_rows()]
-    (track,) = only(w.ngsim_csv(tmp_path / "a.csv", rows, columns=columns)).tracks
-    assert (track.length, track.width) == (4.5, 1.8)
-
-
 def test_separators_between_thousands(tmp_path):
     """A spreadsheet's export: "1,118,846,979,700" and "2,224"."""
     rows = periods()
@@ -149,11 +139,10 @@ def test_separators_between_thousands(tmp_path):
     plain = only(w.ngsim_csv(tmp_path / "a.csv", rows, sites=sites))
     assert "800,003," in w.grouped(tmp_path / "a.csv").read_text()
     assert digest(only(tmp_path / "a.csv")) == digest(plain)
-    text = (tmp_path / "a.csv").read_text()
-    (tmp_path / "a.csv").write_text(text.replace('"800,003,', '"800,03,', 1))
+    logs.edit(tmp_path / "a.csv", '"800,003,', '"800,03,')
     source = w.strict(tmp_path / "strict.toml", "ngsim")
-    with pytest.raises(InputError, match=r"a\.csv: line 113: Global_Time: '800,03,"):
-        read(tmp_path / "a.csv", source)
+    line = logs.refused(read, tmp_path / "a.csv", source)
+    assert "a.csv: line 113: Global_Time: '800,03," in line
 
 
 def test_release_with_every_log_twice(tmp_path):
@@ -186,8 +175,7 @@ def test_arterials_without_a_location(tmp_path, writer):
     columns = (*w.NGSIM_COLUMNS[:14], *zones, *w.NGSIM_COLUMNS[14:])
     options = {"columns": columns} if writer is w.ngsim_csv else {}
     path = writer(tmp_path / "trajectories.dat", rows, **options)
-    with pytest.raises(InputError, match="arterials have no straight lanes"):
-        read(path)
+    assert "arterials have no straight lanes" in logs.refused(read, path)
 
 
 @pytest.mark.parametrize("writer", [w.ngsim_text, w.ngsim_csv])
@@ -204,33 +192,28 @@ def test_stamped_rows_may_come_in_any_order(tmp_path, writer):
     assert whole.tracks[2].t[0] == 3600.0
 
 
-def bad_rows(place, column, value):
-    rows = w.ngsim_rows()
-    rows[place][column] = value
-    return rows
+ROWS = w.ngsim_rows()
 
 
-def backwards():
-    rows = w.ngsim_rows()
-    return [*rows[:10], *rows[12:], *rows[10:12]]
-
-
-def conflicting():
-    rows = w.ngsim_rows()
-    return [*rows[:4], [*rows[3][:5], 99.0, *rows[3][6:]], *rows[4:]]
+def with_cell(column, value):
+    row = [*ROWS[4][:column], value, *ROWS[4][column + 1 :]]
+    return [*ROWS[:4], row, *ROWS[5:]]
 
 
 @pytest.mark.parametrize(
     ("rows", "line", "field"),
     [
-        (bad_rows(4, 5, "nan"), 5, "Local_Y: 'nan'"),
-        (bad_rows(4, 11, "fast"), 5, "v_Vel: 'fast'"),
-        ([*w.ngsim_rows(), [1, 2, 3]], 41, "3 cells"),
-        ([row[:-1] for row in w.ngsim_rows()], 1, "17 cells"),
-        (backwards(), None, "id 1: t: 10 after 39"),
-        (conflicting(), 5, "id 1: met twice in one frame"),
-        ([[*r[:11], 9.9 * r[11], *r[12:]] for r in w.ngsim_rows()], None, "speed"),
-        ([[r[0], 3 * r[1], *r[2:]] for r in w.ngsim_rows()], None, "t: median step 3"),
+        (with_cell(5, "nan"), 5, "Local_Y: 'nan'"),
+        (with_cell(11, "fast"), 5, "v_Vel: 'fast'"),
+        ([*ROWS, [1, 2, 3]], 41, "3 cells"),
+        ([row[:-1] for row in ROWS], 1, "17 cells"),
+        ([*ROWS[:10], *ROWS[12:], *ROWS[10:12]], None, "id 1: t: 10 after 39"),
+        (
+            [*ROWS[:4], [*ROWS[3][:5], 99.0, *ROWS[3][6:]], *ROWS[4:]],
+            *(5, "id 1: met twice in one frame"),
+        ),
+        ([[*r[:11], 9.9 * r[11], *r[12:]] for r in ROWS], None, "speed"),
+        ([[r[0], 3 * r[1], *r[2:]] for r in ROWS], None, "t: median step 3"),
     ],
 )
 @pytest.mark.parametrize("writer", [w.ngsim_text, w.ngsim_csv])
@@ -238,12 +221,9 @@ def test_malformed_rows(tmp_path, writer, rows, line, field):
     path = writer(tmp_path / "bad.txt", rows)
     header = writer is w.ngsim_csv
     expected = field if line is None else f"line {line + header}: {field}"
-    with pytest.raises(InputError) as error:
-        read(path)
-    message = str(error.value)
+    message = logs.refused(read, path)
     assert message.startswith(str(path))
     assert expected in message
-    assert "\n" not in message
 
 
 @pytest.mark.dataset

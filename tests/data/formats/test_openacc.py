@@ -182,5 +182,6 @@ def test_lanes_of_opposite_directions_and_of_a_second_lane():
     beside = straight(t, (0.0, -5.0), 0.0, 15.0)
     same = straight(t, (0.0, -1.0), 0.0, 14.0)
     assert len(path_lanes([there, back, beside, same], 3.5, 20.0)) == 3
-    jitter = np.random.default_rng(1).normal(size=t.size)
-    assert path_lanes([dataclasses.replace(there, x=5.0 + jitter)], 3.5, None) == ()
+    parked, noise = straight(t, (5.0, 5.0), 0.0, 0.0), np.random.default_rng(1)
+    parked = dataclasses.replace(parked, x=5.0 + noise.normal(size=t.size))
+    assert path_lanes([parked], 3.5, None) == ()
