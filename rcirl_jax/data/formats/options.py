@@ -2,8 +2,8 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import PurePosixPath
 
 from rcirl_jax.data.formats.format import Format
 from rcirl_jax.errors import InputError
@@ -18,27 +18,16 @@ MAX_NAME = 255  # bytes of a file's name
 MAX_PATH = 2048  # bytes of a path; systems take 4096, with the folder before it
 MAX_PARTS = 32  # of a pattern, which pathlib matches by recursion
 UNITS = {
-    "m": 1.0,
-    "ft": FOOT_M,
-    "km": 1e3,
-    "cm": 1e-2,
-    "mm": 1e-3,
-    "m/s": 1.0,
-    "ft/s": FOOT_M,
-    "km/h": 1.0 / 3.6,
-    "mph": MPH_MPS,
-    "kn": 1852.0 / 3600.0,
-    "s": 1.0,
-    "ms": 1e-3,
-    "us": 1e-6,
-    "ns": 1e-9,
-    "min": 60.0,
-    "h": 3600.0,
-    "day": 86400.0,
-    "rad": 1.0,
-    "deg": math.pi / 180.0,
-}
+    **{"m": 1.0, "ft": FOOT_M, "km": 1e3, "cm": 1e-2, "mm": 1e-3},
+    **{"m/s": 1.0, "ft/s": FOOT_M, "km/h": 1.0 / 3.6, "mph": MPH_MPS},
+    **{"kn": 1852.0 / 3600.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    **{"min": 60.0, "h": 3600.0, "day": 86400.0, "rad": 1.0, "deg": math.pi / 180.0},
+}  # unit -> its factor to SI
 KINDS = ("vehicle", "cyclist", "pedestrian", "static")
+TYPES = {
+    **{bool: "true or false", str: "a text", list: "a list", dict: "a table"},
+    **dict.fromkeys((int, float), "a number"),
+}  # of a TOML's values, in words
 
 
 def number(spec: Mapping, key: str, default: float = math.nan) -> float:
@@ -63,13 +52,14 @@ def stated(spec: Mapping, key: str) -> float | None:
     return positive(spec, key) if key in spec.get(USER_KEYS, ()) else None
 
 
-def unit_factor(path: Path, field: str, unit: str, allowed: Sequence[str]) -> float:
-    """Returns the factor from a declared unit to SI."""
-    if unit not in allowed:
+def one_of(spec: Mapping, key: str, allowed: Iterable[str], default: str = "") -> str:
+    """Returns an option that is one of some texts."""
+    value = spec.get(key, default)
+    if not isinstance(value, str) or value not in (names := [*allowed]):
         raise InputError(
-            f"{path}: units.{field}: {unit}: expected one of {', '.join(allowed)}"
+            f"source TOML: {key}: {value}: expected one of {', '.join(names)}"
         )
-    return UNITS[unit]
+    return value
 
 
 def section(spec: Mapping, key: str) -> dict:
@@ -91,12 +81,7 @@ def positive(spec: Mapping, key: str, default: float = math.nan) -> float:
 def recording_car(spec: Mapping) -> tuple[tuple[float, float], ...]:
     """Returns `Track.automated` of the recording car (option `recording_car`)."""
     spans = {"human": (), "automated": ((-math.inf, math.inf),)}
-    driver = spec.get("recording_car", "automated")
-    if driver not in spans:
-        raise InputError(
-            f"source TOML: recording_car: {driver}: expected one of {', '.join(spans)}"
-        )
-    return spans[driver]
+    return spans[one_of(spec, "recording_car", spans, "automated")]
 
 
 def lane_types(
@@ -231,15 +216,7 @@ def _check_type(where: str, value: object, like: object) -> None:
 
 
 def _type(value: object) -> str:
-    kinds = {
-        bool: "true or false",
-        str: "a text",
-        list: "a list",
-        dict: "a table",
-        int: "a number",
-        float: "a number",
-    }
-    return kinds.get(type(value), "another type")
+    return TYPES.get(type(value), "another type")
 
 
 def _is_uniform(values: Sequence) -> bool:

@@ -47,23 +47,17 @@ def test_rows_become_tracks_and_lanes(tmp_path):
     assert recording.group is None
 
 
+KNOTS = (("mph", 0.44704), ("ft/s", 0.3048), ("kn", 1852 / 3600))
+CLOCKS = (
+    *(("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("frame", 0.1)),
+    *(("min", 60.0), ("h", 3600.0), ("day", 86400.0)),
+)
+
+
 @given(
     length=st.sampled_from([("m", 1.0), ("ft", 0.3048)]),
-    speed=st.sampled_from(
-        [
-            ("m/s", 1.0),
-            ("km/h", 1 / 3.6),
-            ("mph", 0.44704),
-            ("ft/s", 0.3048),
-            ("kn", 1852 / 3600),
-        ]
-    ),
-    clock=st.sampled_from(
-        [
-            *(("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("frame", 0.1)),
-            *(("min", 60.0), ("h", 3600.0), ("day", 86400.0)),
-        ]
-    ),
+    speed=st.sampled_from([("m/s", 1.0), ("km/h", 1 / 3.6), *KNOTS]),
+    clock=st.sampled_from(CLOCKS),
     angle=st.sampled_from([("rad", 1.0), ("deg", np.pi / 180)]),
     origin=st.sampled_from([0.0, 1.6e9]),
 )
@@ -109,18 +103,15 @@ def test_heading_and_speed_from_positions(tmp_path):
 
 
 @pytest.mark.parametrize(("point", "shift"), [("front", -2.25), ("rear", 2.25)])
-def test_reference_point(tmp_path, point, shift):
-    source = spec(tmp_path, more=f'reference_point = "{point}"')
-    np.testing.assert_allclose(only(log(tmp_path), source).tracks[0].x[0], shift)
-
-
-def test_turned_axis_and_named_kinds(tmp_path):
-    rows = [[r[0], r[1], r[2], -r[3], "PKW"] for r in cars()]
-    header = ("t", "id", "x", "right", "type")
+def test_reference_point_turned_axis_and_named_kinds(tmp_path, point, shift):
+    rows = [[*r[:3], -r[3], "PKW", 4.5] for r in cars()]
+    header = ("t", "id", "x", "right", "type", "length")
     columns = {"t": "t", "id": "id", "x": "x", "y": "-right", "kind": "type"}
-    source = spec(tmp_path, columns, rest='PKW = "vehicle"')
+    more = f'reference_point = "{point}"'
+    source = spec(tmp_path, columns, rest='PKW = "vehicle"', more=more)
     track = only(log(tmp_path, rows, header), source).tracks[2]
     np.testing.assert_allclose(track.y, -7.0)
+    assert track.x[0] == pytest.approx(20.0 + shift)
     assert track.kind == Kind.VEHICLE
 
 
@@ -150,19 +141,15 @@ points = [[0.0, -3.5], [90.0, -3.5]]
 """
 
 
-def test_lanes_of_the_mapping(tmp_path):
+def test_lanes_of_the_mapping_and_of_a_file(tmp_path):
     source = spec(tmp_path, rest=LANES)
     first, second = only(log(tmp_path), source).lanes
     assert (first.speed_limit, first.right, second.speed_limit) == (13.9, "2", None)
     np.testing.assert_array_equal(first.left_width, [1.5, 1.5])
-
-
-def test_lanes_of_a_file(tmp_path):
     header = ("id", "x", "y", "width", "speed_limit", "successor")
     rows = [("a", 0, 0, 3, 10, "b"), ("a", 50, 0, 4, 10, "b"), ("b", 50, 0, 3, 9, "")]
     w.table(tmp_path / "lanes.csv", header, [*rows, ("b", 90, 5, 3, 9, "")])
     source = spec(tmp_path, rest='[lanes]\nfile = "lanes.csv"\n')
-    log(tmp_path)
     first, second = only(tmp_path, source).lanes
     np.testing.assert_array_equal(first.left_width, [1.5, 2.0])
     assert (first.successors, second.speed_limit) == (("b",), 9.0)
@@ -193,13 +180,8 @@ def test_buses_are_no_feet(tmp_path):
 
 
 SI_COLUMNS = {
-    "t": "Global_Time",
-    "id": "Vehicle_ID",
-    "x": "Local_Y",
-    "y": "-Local_X",
-    "speed": "v_Vel",
-    "length": "v_length",
-    "lane": "Lane_ID",
+    **{"t": "Global_Time", "id": "Vehicle_ID", "x": "Local_Y", "y": "-Local_X"},
+    **{"speed": "v_Vel", "length": "v_length", "lane": "Lane_ID"},
     "recording": "Location",
 }
 

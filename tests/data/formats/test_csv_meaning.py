@@ -65,36 +65,27 @@ FLAGS = [
     ("yes", "no"), ("Yes", "No"), ("TRUE", "FALSE"), ("true", "false"), ("1", "0"),
     ("1.0", "0.0"), ("2", "0"), ("on", "off"), ("Y", "N"), ("ja", "nein"), ("x", ""),
     ("ACC", "human"), ("auto", "manual"), ("WAHR", "FALSCH"), ("an", "aus"),
-    ("vrai", "faux"), ("aktiv", "inaktiv"), ("Verdadero", "Falso"),
+    ("vrai", "faux"), ("aktiv", "inaktiv"), ("Verdadero", "Falso"), ("L2", "L0"),
 ]  # fmt: skip
 
 
 @LONG
 @pytest.mark.parametrize(("yes", "no"), FLAGS)
 def test_flags(tmp_path, yes, no, long_bytes):
-    """An automation drives car1 from 2 s on, and nobody else."""
+    """An automation drives car1 from 2 s on; nobody knows who drives car2."""
     table = [
         [*row, yes if row[1] == "car1" and row[0] >= 2.0 else no]
         for row in people.rows()
     ]
+    for row in table if no else ():
+        row[-1] = "" if row[1] == "car2" else row[-1]
     header = (*people.HEADER, "automated")
-    source = people.spec(tmp_path, header, more=f"long_bytes = {long_bytes}")
+    own = 'automated_values = ["L2", "L3"]\n' if yes == "L2" else ""
+    source = people.spec(tmp_path, header, more=f"{own}long_bytes = {long_bytes}")
     found = people.only(write(tmp_path, table, header), source)
     spans = {track.id: track.automated for track in found.tracks if track.automated}
-    assert spans == {"car1": ((2.0, math.inf),)}
-
-
-def test_flags_of_a_user_and_unknown_ones(tmp_path):
-    header = (*people.HEADER, "automated")
-    table = [
-        [*row, {"car1": "L2", "car2": ""}.get(row[1], "L0")] for row in people.rows()
-    ]
-    path = write(tmp_path, table, header)
-    source = people.spec(tmp_path, header, more='automated_values = ["L2", "L3"]')
-    found = people.only(path, source)
-    # nobody knows who drives car2, so it is no demonstration
-    automated = [track.id for track in found.tracks if track.automated]
-    assert automated == ["car1", "car2"]
+    unknown = {"car2": ((0.0, math.inf),)} if no else {}  # no demonstration
+    assert spans == {"car1": ((2.0, math.inf),), **unknown}
 
 
 # -------------------------------------------------------------------------- wide
@@ -147,17 +138,6 @@ def test_one_row_per_frame(tmp_path, name, columns, long_bytes):
     assert people.rows_of(found) == (710, 0, 0, 0)
 
 
-def test_wide_tables_whose_names_do_not_fit(tmp_path):
-    header, table = wide_frames("{axis}_{car}")
-    path = write(tmp_path, table, header)
-    columns = {"t": "time", "x": "px_{id}", "y": "y_{id}"}
-    line = refused(path, people.spec(tmp_path, columns))
-    assert "columns.x: px_{id}: expected columns of this name and of y_{id}" in line
-    columns = {"t": "time", "id": "x_1", "x": "x_{id}", "y": "y_{id}"}
-    line = refused(path, people.spec(tmp_path, columns))
-    assert "columns.id: x_1: expected none beside columns.x" in line
-
-
 def pneuma(form="{:.6f}"):
     """The text of pNEUMA: a row per vehicle, whose last six columns go on repeating."""
     head = (
@@ -202,15 +182,12 @@ def test_a_row_per_vehicle_as_in_pneuma(tmp_path, long_bytes):
 
 
 def test_a_row_per_vehicle_that_breaks_off(tmp_path):
-    """The others say how many columns repeat."""
+    """The others say how many columns repeat; a cell inside is named by its line."""
     path, source = people.put(tmp_path, a_row_per_vehicle())
     path.write_text(pneuma().replace("; \n", "; 37.97; 23.7; \n", 1))
     found = people.only(path, source)
     assert people.rows_of(found) == (571, 1, 0, 0)
     assert any("first: line 2: 6 cells: expected 10" in note for note in found.notes)
-
-
-def test_a_cell_inside_of_a_long_row_is_named_by_its_line(tmp_path):
     path, source = people.put(tmp_path, a_row_per_vehicle(), "max_bad_rows = 0.0")
     path.write_text(pneuma().replace("; 55.0", "; fast", 1))
     assert "line 2: speed: 'fast" in refused(path, source)
@@ -222,15 +199,11 @@ def test_a_cell_inside_of_a_long_row_is_named_by_its_line(tmp_path):
 def test_whole_numbers_are_ids_without_a_point(tmp_path):
     """A column with holes is one of floating point to pandas."""
     ids = [float(row[1][3:]) for row in people.rows()]
-    path = tmp_path / "log.parquet"
-    path.write_bytes(stored(pq.write_table, id=ids))
-    found = people.only(path, people.spec(tmp_path))
-    assert [track.id for track in found.tracks] == ["0", "1", "2", "3", "4", "5"]
-    (tmp_path / "log.csv").write_text(
-        people.text(people.column(people.rows(), "id", lambda name: f"{name[3:]}.0"))
-    )
-    found = people.only(tmp_path / "log.csv", people.spec(tmp_path))
-    assert [track.id for track in found.tracks] == ["0", "1", "2", "3", "4", "5"]
+    (tmp_path / "log.parquet").write_bytes(stored(pq.write_table, id=ids))
+    write(tmp_path, people.column(people.rows(), "id", lambda name: f"{name[3:]}.0"))
+    for name in ("log.parquet", "log.csv"):
+        found = people.only(tmp_path / name, people.spec(tmp_path))
+        assert [track.id for track in found.tracks] == [*"012345"]
 
 
 def test_a_log_that_lies_twice_in_a_folder_is_read_once(tmp_path):

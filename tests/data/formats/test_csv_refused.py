@@ -7,12 +7,8 @@ import pytest
 
 from tests.data.formats import people
 from tests.data.formats.people import HEADER, Way, column, of, refused, rows, text
-from tests.data.formats.test_csv_ways import (
-    ISO,
-    degrees,
-    heading_as,
-    stored,
-)
+from tests.data.formats.test_csv_meaning import wide_frames
+from tests.data.formats.test_csv_ways import ISO, degrees, heading_as, stored
 
 
 def moved(**options):
@@ -30,6 +26,11 @@ def scaled(factor, *names):
     for name in names:
         table = column(table, name, lambda value: value * factor)
     return of(table)
+
+
+def side_by_side(**options):
+    header, table = wide_frames("{axis}_{car}")
+    return of(table, header, **options)
 
 
 NUMBERED = [*enumerate(rows())]
@@ -57,6 +58,13 @@ REFUSED = {
         rest='[table]\ndecimal = ","\nthousands = ","'
     ),
     "table.repeating: 9: expected up to 8": moved(rest="[table]\nrepeating = 9"),
+    # a row per frame
+    "columns.x: px_{id}: expected columns of this name and of y_{id}": side_by_side(
+        columns={"t": "time", "x": "px_{id}", "y": "y_{id}"}
+    ),
+    "columns.id: x_1: expected none beside columns.x": side_by_side(
+        columns={"t": "time", "id": "x_1", "x": "x_{id}", "y": "y_{id}"}
+    ),
     # columns and lanes
     "columns.y: missing": moved(columns=("t", "id", "x")),
     "column up: missing": moved(columns={"t": "t", "id": "id", "x": "x", "y": "up"}),

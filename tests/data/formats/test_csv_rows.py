@@ -113,20 +113,6 @@ def test_a_road_user_in_two_places_at_once(tmp_path, long_bytes):
 
 
 @LONG
-def test_a_share_of_bad_rows_is_allowed(tmp_path, long_bytes):
-    table = people.rows()
-    for row in table[:36]:
-        row[2] = "?"
-    path = write(tmp_path, table)
-    more = f"long_bytes = {long_bytes}\n"
-    line = refused(path, people.spec(tmp_path, more=more))
-    assert "line 2: x: '?'" in line
-    assert "36 of 720 rows are bad: expected up to 1 %" in line
-    found = people.only(path, people.spec(tmp_path, more=more + "max_bad_rows = 0.05"))
-    assert found.rows.unreadable == 36
-
-
-@LONG
 def test_an_import_counts_what_it_dropped(tmp_path, long_bytes):
     table = people.rows()
     table[5][2] = "west"

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 import pyproj
 import pytest
 
-from rcirl_jax.data.formats.csv.meaning import CONVENTIONS
+from rcirl_jax.data.formats.csv.columns import CONVENTIONS
 from tests.data.formats import people
 from tests.data.formats.people import HEADER, LONG, Way, column, of, rows, text
 

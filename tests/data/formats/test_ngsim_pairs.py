@@ -60,7 +60,7 @@ def test_options(tmp_path):
     assert recording.lanes[0].speed_limit == 30.0
     source.write_text('unit = "yard"\n')
     line = logs.refused(read, path, source)
-    assert "units.unit: yard: expected one of ft, m" in line
+    assert "source TOML: unit: yard: expected one of ft, m" in line
 
 
 def test_only_the_follower_is_an_expert(tmp_path):

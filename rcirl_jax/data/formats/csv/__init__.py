@@ -1,4 +1,4 @@
-"""Tables of a user's own: `reader`, `columns`, `meaning`; `suggest` writes a TOML."""
+"""Tables of a user's own: `reader`, `columns`; `suggest` writes a TOML."""
 
 from rcirl_jax.data.formats.format import Format
 

@@ -13,8 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.formats.csv.columns import LogColumns, columns_of
-from rcirl_jax.data.formats.csv.meaning import Meaning, meaning_of
+from rcirl_jax.data.formats.csv.columns import (
+    LogColumns,
+    Meaning,
+    columns_of,
+    meaning_of,
+)
 from rcirl_jax.data.formats.declared import open_log, track_of
 from rcirl_jax.data.formats.files import (
     firsts_of_a_name,
@@ -31,7 +35,14 @@ from rcirl_jax.data.formats.lanes import (
     path_lanes,
     straight_lanes,
 )
-from rcirl_jax.data.formats.options import KINDS, number, patterns, section, stated
+from rcirl_jax.data.formats.options import (
+    KINDS,
+    number,
+    one_of,
+    patterns,
+    section,
+    stated,
+)
 from rcirl_jax.data.formats.shapes import local_origin, origin_notes
 from rcirl_jax.data.formats.tracks import spans_of, split_tracks
 from rcirl_jax.data.readers.long_logs import rows_of
@@ -178,12 +189,7 @@ def _track(name: str, rows: Rows, log: Log, meaning: Meaning) -> Track:
             f"{log.table.path}: id {name}: kind: {found}: expected one of "
             f"{', '.join(KINDS)}, or an entry in [kinds]"
         )
-    reference = spec.get("reference_point", "centre")
-    if reference not in REFERENCE:
-        raise InputError(
-            f"source TOML: reference_point: {reference}: "
-            f"expected one of {', '.join(REFERENCE)}"
-        )
+    reference = one_of(spec, "reference_point", REFERENCE, "centre")
     automated = np.zeros(rows["t"].size, bool)
     if "automated" in rows:
         automated = meaning.automated(rows["automated"])

@@ -16,30 +16,28 @@ import numpy as np
 
 from rcirl_jax.data.formats.csv.columns import (
     ALLOWED_UNITS,
+    CONVENTION,
     DEGREES,
     HOLE,
     NEEDED,
+    NO,
     OPTIONAL,
     RATE_HZ,
     WORD,
+    YES,
     LogColumns,
+    Meaning,
     date_pattern,
     first_cell,
-    known_cells,
-    sampled,
-    words_of,
-)
-from rcirl_jax.data.formats.csv.meaning import (
-    CONVENTION,
-    NO,
-    YES,
-    Meaning,
     half_seconds,
     is_large,
+    known_cells,
     meaning_of,
+    sampled,
     with_velocity,
+    words_of,
 )
-from rcirl_jax.data.formats.csv.reader import PATTERNS, opened
+from rcirl_jax.data.formats.csv.reader import PATTERNS, Log, opened
 from rcirl_jax.data.formats.files import table_stem
 from rcirl_jax.data.formats.options import KINDS, UNITS
 from rcirl_jax.data.readers.tables.rows import LINE, Rows
@@ -57,15 +55,16 @@ from rcirl_jax.runtime.specs import load_toml, spec_root
 USUAL_RATES = (1, 2, 4, 5, 10, 12.5, 15, 20, 24, 25, 29.97, 30, 50, 60, 100, 120)
 RATE_FITS = 0.1  # relative
 FRAMES_FIT = 0.02  # likewise, of a rate that speeds tell
+SPEED_FITS = 0.06  # likewise, of a unit of speed
 NO_RATE = "rate_hz: rows per second of one road user; 10 is assumed"
 LONG_CAR_M = 9.0  # m; a longer median vehicle was measured in feet
 # recorded speed over that of the positions, both in m/s if it were m/s
 SPEED_RATIOS = {"m/s": 1.0, "km/h": 3.6, "ft/s": 3.2808, "mph": 2.2369, "kn": 1.9438}
 ROWS_SHOWN = 5
-SHOWN = ("t", "id", "x", "y", "heading", "speed", "length", "width", "kind", "lane")
-SHOWN_UNITS = {
-    **dict.fromkeys(("x", "y", "length", "width"), "m"),
-    **{"t": "s", "heading": "deg", "speed": "m/s"},
+# field -> its unit where rows are shown, "": none
+SHOWN = {
+    **{"t": "s", "id": "", "x": "m", "y": "m", "heading": "deg", "speed": "m/s"},
+    **{"length": "m", "width": "m", "kind": "", "lane": ""},
 }
 INSTEAD = {
     **{"heading": "by the positions", "speed": "by the positions"},
@@ -117,12 +116,12 @@ def suggested(path: Path) -> Suggestion:
         table = open_table(path)
         guess = _guess_columns(table)
         _guess_time_form(table, guess)
-        raw = _first_rows(path, guess.spec())
+        _, raw = _first_rows(path, guess.spec())
         _guess_clock(table, raw, guess)
         _guess_lengths(table, raw, guess)
         _guess_heading_and_speed(table, raw, guess)
         _guess_texts(raw, guess)
-        rows, meaning, columns = _without_wrong_headings(path, guess)
+        rows, meaning, columns = _understood(path, guess)
         lines = _in_words(table, guess, (*columns.notes, *meaning.notes))
         lines += ["", "the first rows as understood:", *_shown(rows)]
         return Suggestion(toml=_toml_of(path, guess, meaning), lines=tuple(lines))
@@ -131,7 +130,6 @@ def suggested(path: Path) -> Suggestion:
 def _guess_columns(table: Table) -> _Guess:
     """Field -> column, and how a table with a row per frame was told."""
     found, said = fields_by_name(table.header), []
-    bare = [re.sub(r"\d+", "", name) for name in table.header]
     forms: list[str] = []  # {id} for the number in a name
     for name in table.header:
         match = re.fullmatch(r"(\D*)(\d+)(\D*)", name)
@@ -144,13 +142,14 @@ def _guess_columns(table: Table) -> _Guess:
         if field in (*NEEDED, *OPTIONAL) and field not in ("t", "id")
     }
     # columns from which no other differs by a number only
+    bare = [re.sub(r"\d+", "", name) for name in table.header]
     alone = {f for f, n in found.items() if bare.count(re.sub(r"\d+", "", n)) == 1}
     if {"x", "y"} <= wide.keys() and not {"id", "x", "y"} <= alone:
         found = {k: v for k, v in found.items() if k == "t"} | wide
         said.append(f"a row per frame: {wide['x']}, {wide['y']} for each road user")
-    places = ("lat", "lon") if "lat" in found else ("x", "y")
-    needed = ("t", *places) if HOLE in found.get("x", "") else ("t", "id", *places)
-    missing = [field for field in needed if field not in found]
+    needed = ("t", "id", *(("lat", "lon") if "lat" in found else ("x", "y")))
+    is_wide = HOLE in found.get("x", "")
+    missing = [f for f in needed if f not in found and not (is_wide and f == "id")]
     if missing:
         raise InputError(
             f"{table.path}: no column looks like {', '.join(missing)}: expected them "
@@ -159,12 +158,12 @@ def _guess_columns(table: Table) -> _Guess:
     return _Guess(columns=found, said=said)
 
 
-def _first_rows(path: Path, spec: Mapping) -> Rows:
-    """Rows of the first MiB as a source TOML takes them, texts as text."""
+def _first_rows(path: Path, spec: Mapping) -> tuple[Log, Rows]:
+    """A log, and rows of its first MiB as a source TOML takes them."""
     log = opened(path, dict(spec))
     for batch in batches(log.table, log.columns.fields, log.stats):
         if batch[LINE].size:
-            return as_texts(log.table, batch)
+            return log, as_texts(log.table, batch)
     log.stats.check()
     raise InputError(f"{path}: rows: none: expected rows below the header")
 
@@ -192,6 +191,12 @@ def _guess_time_form(table: Table, guess: _Guess) -> None:
         )
 
 
+def _usual_rate(rate: float, fits: float) -> float | None:
+    """The usual rate [1/s] that a rate is nearest to; None: none is near."""
+    near = min(USUAL_RATES, key=lambda usual: abs(rate / usual - 1.0))
+    return near if abs(rate / near - 1.0) < fits else None
+
+
 def _guess_clock(table: Table, raw: Rows, guess: _Guess) -> None:
     """Unit of the time and rows per second, by the step of the road users' times."""
     ids = np.unique(raw["id"], return_inverse=True)[1]
@@ -200,10 +205,11 @@ def _guess_clock(table: Table, raw: Rows, guess: _Guess) -> None:
     steps = steps[steps > 0.0]
     step = float(np.median(steps)) if steps.size else math.nan
     if "t" not in guess.units:
-        name, possible = guess.columns["t"], ("s", "ms", "us", "ns", "day")
-        unit = _said_unit(table, name, ("ms", "us", "ns", "s"))
-        if not unit and "frame" in name.lower() and step == round(step) < 10:
+        unit = _said_unit(table, "t", guess, ("ms", "us", "ns", "s"))
+        is_frame = "frame" in guess.columns["t"].lower()
+        if not unit and is_frame and step == round(step) < 10:
             unit = "frame"
+        possible = ("s", "ms", "us", "ns", "day")
         fitting = (u for u in possible if 0.005 <= step * UNITS[u] <= 2.0)
         unit = unit or next(fitting, "s")
         if unit == "frame" and step > 1.0:
@@ -214,18 +220,20 @@ def _guess_clock(table: Table, raw: Rows, guess: _Guess) -> None:
         guess.open.append(NO_RATE)
         return
     rate = 1.0 / step
-    near = min(USUAL_RATES, key=lambda usual: abs(rate / usual - 1.0))
-    guess.rate_hz = near if abs(rate / near - 1.0) < RATE_FITS else float(f"{rate:.4g}")
+    guess.rate_hz = _usual_rate(rate, RATE_FITS) or float(f"{rate:.4g}")
     guess.said.append(
         f"rate_hz = {guess.rate_hz:g}: a row of a road user every {1 / rate:.4g} s"
     )
 
 
-def _said_unit(table: Table, column: str, allowed: Sequence[str]) -> str:
+def _said_unit(
+    table: Table, field: str, guess: _Guess, allowed: Sequence[str] = ()
+) -> str:
     """The unit that a column's name says, or the line below the header."""
-    bare = column.removeprefix("-")
+    allowed = allowed or ALLOWED_UNITS[field]
+    bare = guess.columns[field].removeprefix("-")
     own = "" if HOLE in bare else table.unit_of(bare)
-    return unit_of(column, allowed) or unit_of(f"[{own}]", allowed)
+    return unit_of(bare, allowed) or unit_of(f"[{own}]", allowed)
 
 
 def _guess_lengths(table: Table, raw: Rows, guess: _Guess) -> None:
@@ -235,10 +243,10 @@ def _guess_lengths(table: Table, raw: Rows, guess: _Guess) -> None:
     known = raw.get("length", np.zeros(0))
     known = known[np.isfinite(known)]
     is_long = bool(known.size) and float(np.median(known)) > LONG_CAR_M
-    for field in ("x", "y", "length", "width"):
-        if field in guess.columns:
-            said = _said_unit(table, guess.columns[field], ALLOWED_UNITS["length"])
-            guess.units[field] = said or ("ft" if is_long else "m")
+    lengths = ("x", "y", "length", "width")
+    for field in (name for name in lengths if name in guess.columns):
+        said = _said_unit(table, field, guess, ALLOWED_UNITS["length"])
+        guess.units[field] = said or ("ft" if is_long else "m")
     if is_long:
         guess.said.append(f"length: {np.median(known):.3g} in the median: feet")
 
@@ -246,15 +254,13 @@ def _guess_lengths(table: Table, raw: Rows, guess: _Guess) -> None:
 def _guess_heading_and_speed(table: Table, raw: Rows, guess: _Guess) -> None:
     """Units of angles by their size; of speeds by the speed of the positions."""
     if "heading" in guess.columns:
-        said = _said_unit(table, guess.columns["heading"], ("deg", "rad"))
-        by_size = "deg" if is_large(raw["heading"]) else "rad"
-        guess.units["heading"] = said or by_size
+        said = _said_unit(table, "heading", guess, ("deg", "rad"))
+        guess.units["heading"] = said or ("deg" if is_large(raw["heading"]) else "rad")
     speeds = [field for field in ("speed", "vx", "vy") if field in guess.columns]
-    allowed = ALLOWED_UNITS["speed"]
-    units = {f: _said_unit(table, guess.columns[f], allowed) for f in speeds}
+    units = {field: _said_unit(table, field, guess) for field in speeds}
     guess.units.update({field: units[field] or "m/s" for field in speeds})
     told = ["speed"] if "speed" in speeds else speeds  # by which the speed is known
-    if told == ["vy"] or told == ["vx"] or not told:
+    if told not in (["speed"], ["vx", "vy"]):
         return
     is_said = any(units[field] for field in told)
     ratio = None
@@ -263,9 +269,7 @@ def _guess_heading_and_speed(table: Table, raw: Rows, guess: _Guess) -> None:
     if guess.rate_hz is None and ratio is not None:
         # the usual rate at which frames are apart as recorded speeds say, if one is
         for unit, times in SPEED_RATIOS.items():
-            rate = RATE_HZ * ratio / times
-            near = min(USUAL_RATES, key=lambda usual: abs(rate / usual - 1.0))
-            if abs(rate / near - 1.0) < FRAMES_FIT:
+            if (near := _usual_rate(RATE_HZ * ratio / times, FRAMES_FIT)) is not None:
                 guess.rate_hz = near
                 guess.open.remove(NO_RATE)
                 guess.said.append(
@@ -275,8 +279,9 @@ def _guess_heading_and_speed(table: Table, raw: Rows, guess: _Guess) -> None:
                 break
     if is_said or ratio is None:
         return
-    unit = min(SPEED_RATIOS, key=lambda name: abs(ratio / SPEED_RATIOS[name] - 1.0))
-    if abs(ratio / SPEED_RATIOS[unit] - 1.0) > 0.06:
+    apart = {unit: abs(ratio / times - 1.0) for unit, times in SPEED_RATIOS.items()}
+    unit = min(apart, key=lambda name: apart[name])
+    if apart[unit] > SPEED_FITS:
         guess.open.append(f"units.speed: {ratio:.3g} times the speed of the positions")
         unit = "m/s"
     else:
@@ -286,7 +291,7 @@ def _guess_heading_and_speed(table: Table, raw: Rows, guess: _Guess) -> None:
 
 def _speed_ratio(path: Path, guess: _Guess) -> float | None:
     """Recorded speed over that of the positions; None: too few road users move."""
-    rows, _, columns = _without_wrong_headings(path, guess)
+    rows, _, columns = _understood(path, guess)
     first, _, last = half_seconds(rows, columns.rate_hz)
     dx, dy, dt = (rows[name][last] - rows[name][first] for name in ("x", "y", "t"))
     real, found = np.hypot(dx, dy) / np.maximum(dt, 1e-9), rows["speed"][first]
@@ -309,27 +314,22 @@ def _guess_texts(raw: Rows, guess: _Guess) -> None:
             del guess.columns["automated"]
 
 
-def _without_wrong_headings(
-    path: Path, guess: _Guess
-) -> tuple[Rows, Meaning, LogColumns]:
-    """What is understood, by the positions where headings contradict them."""
+def _understood(path: Path, guess: _Guess) -> tuple[Rows, Meaning, LogColumns]:
+    """First rows in SI units, as an import takes them.
+
+    Headings that contradict the positions are left out of the guess.
+    """
+    log, rows = _first_rows(path, guess.spec())
+    rows = log.placed(rows)
+    flags = np.unique(rows.get("automated", np.zeros(0, str))).tolist()
     try:
-        return _understood(path, guess.spec())
+        meaning = meaning_of(path, [rows], flags, log.columns, log.spec)
     except InputError as error:
         if "heading" not in guess.columns:
             raise
         guess.open.append(str(error).removeprefix(f"{path}: "))
-        for part in (guess.columns, guess.units):
-            part.pop("heading", None)
-        return _understood(path, guess.spec())
-
-
-def _understood(path: Path, spec: dict) -> tuple[Rows, Meaning, LogColumns]:
-    """First rows in SI units, as an import takes them."""
-    log = opened(path, spec)
-    rows = log.placed(_first_rows(path, spec))
-    texts = np.unique(rows.get("automated", np.zeros(0, str))).tolist()
-    meaning = meaning_of(path, [rows], texts, log.columns, spec)
+        del guess.columns["heading"], guess.units["heading"]
+        return _understood(path, guess)
     return with_velocity(meaning.applied(rows)), meaning, log.columns
 
 
@@ -340,15 +340,13 @@ def _in_words(table: Table, guess: _Guess, notes: Sequence[str]) -> list[str]:
     for field, column in columns.items():
         unit = f", {guess.units[field]}" if field in guess.units else ""
         found.append(f"{field}: column {column}{unit}")
-    if {"vx", "vy"} <= columns.keys():
-        columns = {"heading": "", "speed": "", **columns}
-    missing = [f"{f}: no column; {i}" for f, i in INSTEAD.items() if f not in columns]
-    used = [re.escape(n).replace(re.escape(HOLE), ".+") for n in columns.values() if n]
-    unused = [
-        name
-        for name in table.header
-        if name and not any(re.fullmatch(form, name) for form in used)
-    ]
+    known = {*columns}
+    known |= {"heading", "speed"} if {"vx", "vy"} <= known else set()
+    missing = [f"{f}: no column; {i}" for f, i in INSTEAD.items() if f not in known]
+    used = "|".join(
+        re.escape(n).replace(re.escape(HOLE), ".+") for n in columns.values()
+    )
+    unused = [name for name in table.header if name and not re.fullmatch(used, name)]
     return [
         *(f"recognised: {line}" for line in (*found, *guess.said, *notes)),
         *(f"not known: {line}" for line in (*guess.open, *missing, *NEVER_KNOWN)),
@@ -358,26 +356,23 @@ def _in_words(table: Table, guess: _Guess, notes: Sequence[str]) -> list[str]:
 
 def _shown(rows: Rows) -> list[str]:
     """The first rows as a table: m, m/s, degrees."""
-    names = [name for name in SHOWN if name in rows]
-    origin = rows["t"].min()
-    cells = [[f"{n} [{SHOWN_UNITS[n]}]" if n in SHOWN_UNITS else n for n in names]]
-    for row in np.argsort(rows[LINE], kind="stable")[:ROWS_SHOWN]:
-        cells.append([])
-        for name in names:
-            value = rows[name][row]
-            if name == "t":
-                value = value - origin
-            elif name == "heading":
-                value = float(np.rad2deg(np.angle(np.exp(1j * value))))
-            text = str(value)
-            if isinstance(value, float):
-                text = "" if math.isnan(value) else f"{value:.2f}"
-            cells[-1].append(text or "unknown")
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return [
-        "  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True))
-        for row in cells
-    ]
+    first = np.argsort(rows[LINE], kind="stable")[:ROWS_SHOWN]
+    columns = []
+    for name, unit in SHOWN.items():
+        if name not in rows:
+            continue
+        values = rows[name][first]
+        if name == "t":
+            values = values - rows["t"].min()
+        elif name == "heading":
+            values = np.rad2deg(np.angle(np.exp(1j * values)))
+        cells = [
+            f"{v:.2f}" if isinstance(v, float) else str(v) for v in values.tolist()
+        ]
+        cells = ["unknown" if cell in ("", "nan") else cell for cell in cells]
+        cells.insert(0, f"{name} [{unit}]" if unit else name)
+        columns.append([cell.rjust(max(map(len, cells))) for cell in cells])
+    return list(map("  ".join, zip(*columns, strict=True)))
 
 
 TOML = """\

@@ -32,11 +32,12 @@ from rcirl_jax.data.formats.files import (
 )
 from rcirl_jax.data.formats.lanes import StraightLane, straight_lanes
 from rcirl_jax.data.formats.options import (
+    UNITS,
     number,
+    one_of,
     patterns,
     positive,
     section,
-    unit_factor,
 )
 from rcirl_jax.data.formats.tracks import spans_of, split_tracks
 from rcirl_jax.data.readers.long_logs import rows_of
@@ -173,7 +174,7 @@ def _has_stamps(table: Table) -> bool:
 
 def _fields(table: Table, spec: dict, stamped: bool) -> list[Field]:
     """Columns that are read, in SI units; those that may be missing are, if there."""
-    unit = unit_factor(table.path, "unit", spec["unit"], ("ft", "m"))
+    unit = UNITS[one_of(spec, "unit", ("ft", "m"))]
     known = NEEDED | {f: c for f, c in OPTIONAL.items() if table.has(c[0])}
     kinds = {field: kind for field, (_, kind) in known.items()}
     columns = {field: column for field, (column, _) in known.items()}

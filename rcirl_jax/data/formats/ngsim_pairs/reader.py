@@ -25,11 +25,12 @@ from rcirl_jax.data.formats.declared import open_log, read_log
 from rcirl_jax.data.formats.files import files_below
 from rcirl_jax.data.formats.lanes import StraightLane, straight_lanes
 from rcirl_jax.data.formats.options import (
+    UNITS,
     number,
+    one_of,
     one_pattern,
     positive,
     section,
-    unit_factor,
 )
 from rcirl_jax.data.formats.tracks import split_tracks
 from rcirl_jax.data.readers.tables.rows import LINE, Rows, attach_row_stats
@@ -107,7 +108,7 @@ def _recording(
     group: str,
     lengths: dict[tuple[str, str], float],
 ) -> Recording:
-    factor = unit_factor(path, "unit", spec["unit"], ("ft", "m"))
+    factor = UNITS[one_of(spec, "unit", ("ft", "m"))]
     run, follower, leader = _ids(path)
     length = float(np.median(rows["leader_length"]))
     if "spacing" in rows:  # positions are those of front bumpers

@@ -27,7 +27,7 @@ import numpy as np
 from rcirl_jax.data.formats.declared import read_log, track_of
 from rcirl_jax.data.formats.files import files_below, log_name
 from rcirl_jax.data.formats.lanes import path_lanes
-from rcirl_jax.data.formats.options import number, one_pattern
+from rcirl_jax.data.formats.options import number, one_of, one_pattern
 from rcirl_jax.data.formats.projection import utm, utm_zone
 from rcirl_jax.data.formats.shapes import local_origin
 from rcirl_jax.data.formats.tracks import spans_of, split_tracks
@@ -69,16 +69,10 @@ class _Car:
     modes: np.ndarray  # [n] who drives: "human", "acc" or "unknown"
     spacing: np.ndarray | None  # [n] m, bumper to bumper to the next car
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Drive:
-    """One file: when and by whom it was driven."""
-
-    path: Path
-    date: str  # "" where the file says none
-    t: np.ndarray  # [n] s, from 0
-    cars: dict[int, _Car]  # by their numbers in the platoon
-    notes: tuple[str, ...]
+    @property
+    def known(self) -> np.ndarray:
+        """Whether each sample [n] has a place and a speed."""
+        return np.isfinite(self.x) & np.isfinite(self.y) & np.isfinite(self.speed)
 
 
 def is_log(file: Path, table: Table | None) -> bool:
@@ -97,30 +91,26 @@ def is_log(file: Path, table: Table | None) -> bool:
 def _is_drive(path: Path) -> bool:
     """Whether a table is a drive, or so damaged that one cannot tell."""
     try:
-        lines = _first_lines(path)
+        lines, header = _first_lines(path)
     except InputError:
         return True
-    if _ends_with_names(lines):
-        return any(COLUMN.fullmatch(name) for name in lines[-1])
+    if header:
+        return any(map(COLUMN.fullmatch, header))
     firsts = {line[0].lower() for line in lines if line}
     return not firsts or not firsts.isdisjoint(METADATA)
 
 
-def _first_lines(path: Path) -> list[list[str]]:
-    """Cells of the lines down to the column names, or of the first ones."""
+def _first_lines(path: Path) -> tuple[list[list[str]], list[str]]:
+    """(cells of the lines above the column names, or of the first ones; the names)."""
     lines: list[list[str]] = []
     for text in head_of(path)[1][:MAX_HEADER_LINES]:
         cells = [cell.strip().strip('"') for cell in text.strip().split(",")]
         while cells and not cells[-1]:
             cells.pop()
+        if cells and cells[0].lower() == "time":
+            return lines, cells
         lines.append(cells)
-        if _ends_with_names(lines):
-            break
-    return lines
-
-
-def _ends_with_names(lines: list[list[str]]) -> bool:
-    return bool(lines and lines[-1]) and lines[-1][0].lower() == "time"
+    return lines, []
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
@@ -141,37 +131,41 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """Yields recordings of `block_s` seconds, file by file."""
     for file in parts(path, spec):
         stats = RowStats(path=file, allowed=allowed_share(spec))
-        for block in _blocks(_read_drive(file, spec, stats), spec):
+        for block in _blocks(file, spec, stats):
             yield validate_recording(attach_row_stats(block, stats), file)
 
 
-def _read_drive(path: Path, spec: Mapping, stats: RowStats) -> _Drive:
-    """A file's cars that have positions; column names stand below the metadata.
+def _read_drive(
+    path: Path, spec: Mapping, stats: RowStats
+) -> tuple[np.ndarray, dict[int, _Car], str, list[str]]:
+    """(t [n] s from 0, cars by their numbers, date, notes) of a file.
+
+    Cars without positions are left out; column names stand below the metadata.
 
     Raises:
       InputError: no table of a drive, a column of a car met twice, or numbers beyond
         any place, speed or time.
     """
-    lines = _first_lines(path)
-    if not _ends_with_names(lines):
+    lines, header = _first_lines(path)
+    if not header:
         raise InputError(
             f"{path}: column Time: missing: expected it in the first "
             f"{MAX_HEADER_LINES} lines, below the metadata"
         )
-    time, *header = lines[-1]
+    time, *names = header
     columns: dict[int, dict[str, str]] = {}  # car -> what it is -> its column
     kinds: dict[str, str] = {}
-    for name in header:
+    for name in names:
         if match := COLUMN.fullmatch(name):
             if name in kinds:
                 raise InputError(f"{path}: column {name!r}: met twice: expected once")
             columns.setdefault(int(match[2]), {})[match[1]] = name
             kinds[name] = KINDS.get(match[1], "number")
-    options = {"delimiter": ",", "names": [time, *header], "skip": len(lines)}
+    options = {"delimiter": ",", "names": header, "skip": len(lines) + 1}
     table = open_table(path, options)
     options = {"t": time, "user": None, "name_of": lambda _: "of the row"}
     rows = read_log(table, stats, {time: "time"}, kinds, **options)
-    about = {cells[0].lower(): cells[1:] for cells in lines[:-1] if cells}
+    about = {cells[0].lower(): cells[1:] for cells in lines if cells}
     cars, notes = {}, []
     for number_, found in sorted(columns.items()):
         values = {part: rows[name] for part, name in found.items()}
@@ -182,16 +176,10 @@ def _read_drive(path: Path, spec: Mapping, stats: RowStats) -> _Drive:
             notes.append(f"car {number_} has no positions; left out")
     if not cars:
         raise InputError(
-            f"{path}: columns: {[time, *header][:8]}: expected Speed1, E1, N1 of one "
-            "car or more"
+            f"{path}: columns: {header[:8]}: expected Speed1, E1, N1 of one car or more"
         )
-    return _Drive(
-        path=path,
-        date="-".join(cell for cell in about.get("date", []) if cell),
-        t=rows[time] - rows[time].min(),
-        cars=cars,
-        notes=tuple(notes),
-    )
+    date = "-".join(cell for cell in about.get("date", []) if cell)
+    return rows[time] - rows[time].min(), cars, date, notes
 
 
 def _car(
@@ -263,7 +251,7 @@ def _place(values: Rows) -> tuple[np.ndarray, np.ndarray]:
     return place[:, 0], place[:, 1]
 
 
-def _blocks(drive: _Drive, spec: dict) -> Iterator[Recording]:
+def _blocks(path: Path, spec: dict, stats: RowStats) -> Iterator[Recording]:
     """Parts of a drive; those without a car in motion or at rest are left out."""
     block_s, rate = number(spec, "block_s"), number(spec, "rate_hz")
     if rate <= 0.0 or not (block_s == 0.0 or block_s >= MIN_BLOCK_S):
@@ -271,20 +259,19 @@ def _blocks(drive: _Drive, spec: dict) -> Iterator[Recording]:
             f"source TOML: rate_hz, block_s: {rate:g}, {block_s:g}: expected above 0, "
             f"and at least {MIN_BLOCK_S:g} s or 0 (whole drives)"
         )
-    if (wanted := spec["drivers"]) not in DRIVERS:
-        raise InputError(f"source TOML: drivers: {wanted}: expected one of {DRIVERS}")
-    part = np.zeros(drive.t.size) if block_s == 0.0 else drive.t // block_s
+    wanted, width = one_of(spec, "drivers", DRIVERS), number(spec, "lane_width_m")
+    t, cars, date, notes = _read_drive(path, spec, stats)
+    notes += _notes(cars)
+    part = np.zeros(t.size) if block_s == 0.0 else t // block_s
     order = np.argsort(part, kind="stable")
     numbers, firsts = np.unique(part[order], return_index=True)
     automated = {
-        number_: spans_of(drive.t, (car.modes != "human") & (wanted != "all"))
-        for number_, car in drive.cars.items()
+        number_: spans_of(t, (car.modes != "human") & (wanted != "all"))
+        for number_, car in cars.items()
     }
-    width, found = number(spec, "lane_width_m"), False
-    notes = [*drive.notes, *_notes(drive)]
-    name = log_name(drive.path, spec, own_name(drive.path))
+    name, found = log_name(path, spec, own_name(path)), False
     for block, rows in zip(numbers, np.split(order, firsts[1:]), strict=True):
-        tracks, origin = _tracks(drive, rows, automated, MAX_GAP_STEPS / rate)
+        tracks, origin = _tracks(path, t, cars, rows, automated, MAX_GAP_STEPS / rate)
         if not tracks:
             continue
         found, lanes = True, path_lanes(tracks, width, None)
@@ -298,27 +285,27 @@ def _blocks(drive: _Drive, spec: dict) -> Iterator[Recording]:
             tracks=tracks,
             lanes=lanes,
             # files of one day share cars and drivers
-            group=f"drives of {drive.date}" if drive.date else drive.path.stem,
+            group=f"drives of {date}" if date else path.stem,
             default_speed_limit=number(spec, "default_speed_limit"),
             notes=(*notes, *([where] if origin.any() else []), fitted),
         )
     if not found:
         raise InputError(
-            f"{drive.path}: tracks: none with Speed and E, N: expected at least one car"
+            f"{path}: tracks: none with Speed and E, N: expected at least one car"
         )
 
 
-def _notes(drive: _Drive) -> list[str]:
+def _notes(cars: Mapping[int, _Car]) -> list[str]:
     """Who drove, and how far positions and sizes are from the recorded spacing.
 
     |p_i - p_{i+1}| - (L_i + L_{i+1}) / 2 - IVS_i, the median over all samples
     """
     shares, errors = [], [np.zeros(0)]
-    for number_, car in drive.cars.items():
+    for number_, car in cars.items():
         share = f"{100.0 * float(np.mean(car.modes == 'human')):.0f} %"
         is_unknown = bool(np.all(car.modes == "unknown"))
         shares.append(f"car {number_} {'unknown' if is_unknown else share}")
-        behind = drive.cars.get(number_ + 1)
+        behind = cars.get(number_ + 1)
         if car.spacing is not None and behind is not None:
             apart = np.hypot(car.x - behind.x, car.y - behind.y)
             errors.append(apart - 0.5 * (car.size[0] + behind.size[0]) - car.spacing)
@@ -332,25 +319,24 @@ def _notes(drive: _Drive) -> list[str]:
 
 
 def _tracks(
-    drive: _Drive,
+    path: Path,
+    t: np.ndarray,
+    cars: Mapping[int, _Car],
     rows: np.ndarray,
     automated: Mapping[int, tuple[tuple[float, float], ...]],
     gap: float,
 ) -> tuple[tuple[Track, ...], np.ndarray]:
-    """Tracks of one block, and their origin [2] m."""
-    used = {}  # rows of each car with a place and a speed
-    for number_, car in drive.cars.items():
-        known = np.isfinite(car.x) & np.isfinite(car.y) & np.isfinite(car.speed)
-        if (part := rows[known[rows]]).size:
-            used[number_] = part
+    """Tracks of one block's rows, and their origin [2] m."""
+    used = {number_: rows[car.known[rows]] for number_, car in cars.items()}
+    used = {number_: part for number_, part in used.items() if part.size}
     if not used:
         return (), np.zeros(2)
-    t0 = min(float(drive.t[part].min()) for part in used.values())
-    places = [(drive.cars[n].x[at], drive.cars[n].y[at]) for n, at in used.items()]
+    t0 = min(float(t[part].min()) for part in used.values())
+    places = [(cars[n].x[at], cars[n].y[at]) for n, at in used.items()]
     origin = local_origin(*np.concatenate(places, axis=1))
     tracks = []
     for number_, part in used.items():
-        car, times = drive.cars[number_], drive.t[part]
+        car, times = cars[number_], t[part]
         low, high = times.min() - gap, times.max() + gap
         spans = tuple(
             (begin - t0, end - t0)
@@ -358,9 +344,9 @@ def _tracks(
             if end >= low and begin <= high
         )
         ids = np.full(part.size, number_)
-        for label, piece in split_tracks(drive.path, ids, times, gap):
+        for label, piece in split_tracks(path, ids, times, gap):
             at = part[piece]
-            values = {"t": drive.t[at] - t0, "speed": car.speed[at]}
+            values = {"t": t[at] - t0, "speed": car.speed[at]}
             values |= {"x": car.x[at] - origin[0], "y": car.y[at] - origin[1]}
             name = car.name + label.removeprefix(str(number_))
             made = track_of(name, values, Kind.VEHICLE, car.size, automated=spans)
