@@ -54,8 +54,8 @@ def stated(spec: Mapping, key: str) -> float | None:
 
 def one_of(spec: Mapping, key: str, allowed: Iterable[str], default: str = "") -> str:
     """Returns an option that is one of some texts."""
-    value = spec.get(key, default)
-    if not isinstance(value, str) or value not in (names := [*allowed]):
+    value, names = spec.get(key, default), [*allowed]
+    if not isinstance(value, str) or value not in names:
         raise InputError(
             f"source TOML: {key}: {value}: expected one of {', '.join(names)}"
         )
