@@ -1,25 +1,34 @@
 """Drives as messages in the order of recording, in windows: bags and cyber records.
 
-A format turns messages into rows of numbers by role (`Rows`). `Drive` holds them until
-the windows that need them are made, and then forgets them, so that the memory that a
-drive takes does not grow with its length. The same rows become the ego's track, the
-spans in which nobody drove by hand, and the boxes of the others.
+A format's subclass of `Drive` turns messages into rows of numbers by role. They are
+held until the windows that need them are made, and then forgotten, so that the memory
+that a drive takes does not grow with its length. The same rows become the ego's track,
+the spans in which nobody drove by hand, and the tracks of the others.
 """
 
+import array
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 
-from rcirl_jax.data.formats.options import number, positive, section
-from rcirl_jax.data.formats.perception import Boxes, ego_boxes, on_clock, tracks_of
-from rcirl_jax.data.formats.tracks import spans_of
+from rcirl_jax.data.formats.options import number, positive, recording_car, section
+from rcirl_jax.data.formats.perception import (
+    Boxes,
+    ego_boxes,
+    fitted_lanes,
+    on_clock,
+    placed,
+    tracks_of,
+)
+from rcirl_jax.data.formats.shapes import check_coordinates, origin_notes
+from rcirl_jax.data.formats.tracks import spans_of, travel_heading
 from rcirl_jax.data.readers import long_logs
-from rcirl_jax.data.recording import MAX_RATE_HZ
+from rcirl_jax.data.recording import MAX_RATE_HZ, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording, Track
 
@@ -27,70 +36,60 @@ RATE_HZ = 10.0  # 1/s, of recordings
 MAX_GAP_S = 0.55  # s without a message inside one track
 WINDOW_S = 300.0  # s, longest window of a drive
 MIN_WINDOW_S = 1.0  # s that it may be; each window costs as much as its surroundings
-PIECE_S = 60.0  # s of recording after which rows are handed on
+PIECE_S = 60.0  # s of recording after which rows are looked at
 LATE_S = 2.0  # s, messages of one time are recorded within it
 MAX_SILENCE_S = 1.0  # s without a message on who drives, after which nobody knows
 MAX_DURATION_S = 86400.0  # s, of one drive
 MAX_ROWS = 5_000_000  # obstacle states held at once
 
-
-@dataclasses.dataclass(kw_only=True)
-class Rows:
-    """A piece of a drive: rows [n, columns] by role, in the order of recording."""
-
-    tables: Mapping[str, np.ndarray]
-    notes: list[str] = dataclasses.field(default_factory=list)
-    progress: float = 1.0  # share of the drive that is read with them
+Row = tuple[float, ...]
 
 
 class Drive:
-    """Rows of a drive while it is read: what windows still need of them.
+    """One drive: rows by role while windows still need them, and its recordings.
 
-    Times are s since the first place of a road user. A format whose messages are
-    stamped by several clocks overrides `stamps`.
+    Column 0 of a row is its time [s] by the message's stamp. Besides it has a row of
+    role "ego": x, y [m], heading [rad], speed [m/s], NaN where it is not known; of
+    "velocity": speed [m/s]; of "driver": 1 where a human drives; of obstacles: number,
+    x, y [m], heading [rad], speed [m/s], length, width [m], kind. More columns may
+    follow, and other roles.
 
     Args:
-      path: named in errors.
-      widths: role -> number of columns; t [s] is column 0.
-      places: roles that say where somebody is, the ego's first.
+      path: file that errors name.
+      spec: source TOML.
+      name: of the drive's recordings.
+      group: vehicle-disjoint group of its windows; default: its name.
     """
 
+    widths: ClassVar[Mapping[str, int]]  # role -> number of columns
+    obstacles: ClassVar[Sequence[str]] = ("obstacles",)  # the first with rows counts
+    # source, licence, and m/s where no lane says its limit
+    usual: ClassVar[tuple[str, str, float]]
+    car: ClassVar[Mapping[str, float]]  # measures, see `ego_boxes`
     stamp_field = "header.stamp"  # named in errors
-    driver_role = "driver"  # its last message before a window is in force there
+    by_hand = "driven by hand"  # named in notes
+    has_no_map = "no map given"
 
-    def __init__(
-        self, path: Path, widths: Mapping[str, int], places: Sequence[str]
-    ) -> None:
-        self.path, self.places = path, places
-        self.tables = {role: np.zeros((0, width)) for role, width in widths.items()}
-        self.notes: list[str] = []
+    def __init__(self, path: Path, spec: dict, name: str, group: str = "") -> None:
+        self.path, self.spec, self.name = path, spec, name
+        self.group = group or name
+        self.tables = {role: np.zeros((0, n)) for role, n in self.widths.items()}
+        self.notes: list[str] = []  # of what was read since the last window
         self.progress = 0.0  # share of the drive that is read
         self.end = -math.inf  # s, of the last place
         self.start = math.nan  # s, the stamp of the first place; NaN: none yet
         self._since = -math.inf  # s, rows from before it were forgotten
+        self._new = {role: array.array("d") for role in self.widths}
+
+    # ---------------------------------------------------------- what formats say
+
+    def rows(self) -> Iterator[tuple[str, float, float, Row]]:
+        """Yields (role, s of recording, share of the drive that is read, row)."""
+        raise NotImplementedError
 
     def stamps(self, role: str) -> np.ndarray:
         """Returns the time [n] s of each row of a role, on the drive's one clock."""
         return self.tables[role][:, 0]
-
-    def clock(self, role: str) -> np.ndarray:
-        """Returns the time [n] s of each row since the drive's start."""
-        return self.stamps(role) - self.start
-
-    @property
-    def in_use(self) -> Sequence[str]:
-        """Roles of `places` whose rows become tracks."""
-        return self.places
-
-    @property
-    def is_cut(self) -> bool:
-        """True once rows were forgotten: the clock is settled from then on."""
-        return self._since > -math.inf
-
-    @property
-    def now(self) -> float:
-        """Returns the time [s] that the drive is read up to."""
-        return self.end
 
     def settle(self) -> None:
         """Chooses where the clock starts; called while all rows are held."""
@@ -98,20 +97,80 @@ class Drive:
         self.start = float(stamps.min()) if stamps.size else math.nan
         self.end = -math.inf
 
-    def add(self, rows: Rows) -> None:
-        """Appends rows that follow.
+    @property
+    def now(self) -> float:
+        """Returns the time [s] that the drive is read up to."""
+        return self.end
+
+    def name_of(self, number: int) -> str:
+        """Returns the name of the obstacle with a number."""
+        return str(number)
+
+    def selected(self, table: np.ndarray) -> tuple[np.ndarray, list[str]]:
+        """Returns the obstacles [n, columns] that become tracks, times by `clock`."""
+        return table, []
+
+    def surroundings(
+        self,
+        tracks: Sequence[Track],
+        within: tuple[float, float],
+        places: tuple[np.ndarray, np.ndarray, np.ndarray],
+    ) -> tuple[dict[str, Any], list[str]]:
+        """Makes fields of the recording besides its tracks, with notes.
+
+        Args:
+          tracks: around the origin.
+          within: s, when scenes begin.
+          places: x, y [n] m of all samples, and the origin [2] m.
+        """
+        lanes, note = fitted_lanes(tracks, self.spec)
+        return {"lanes": lanes}, [f"{self.has_no_map}; {note}"]
+
+    # --------------------------------------------------------------- rows, clock
+
+    @property
+    def in_use(self) -> tuple[str, str]:
+        """Roles whose rows become tracks: the ego's, that of the obstacles."""
+        met = [role for role in self.obstacles if len(self.tables[role])]
+        return "ego", [*met, self.obstacles[-1]][0]
+
+    def clock(self, role: str) -> np.ndarray:
+        """Returns the time [n] s of each row since the drive's start."""
+        return self.stamps(role) - self.start
+
+    def _pieces(self) -> Iterator[None]:
+        """Takes rows in, a minute at a time, and tells when one is over."""
+        began = None
+        for role, recorded, share, row in self.rows():
+            began = recorded if began is None else began
+            if abs(recorded - began) > PIECE_S:
+                self._take_in()
+                yield
+                began = recorded
+            self.progress = share
+            values = self._new[role]
+            values.extend(row)
+            if len(values) > MAX_ROWS * len(row):
+                break  # that they are too many is said as they are taken in
+        self._take_in()
+        yield
+
+    def _take_in(self) -> None:
+        """Appends the rows that are new.
 
         Raises:
           InputError: too many, too long a drive, or rows of windows long taken.
         """
-        self.tables = {
-            role: np.concatenate([table, rows.tables[role]])
-            for role, table in self.tables.items()
-        }
-        self.notes, self.progress = [*self.notes, *rows.notes], rows.progress
-        seen = sum(len(self.tables[role]) for role in self.places[1:])
-        check_held(str(self.path), seen)
-        if not self.is_cut:
+        for role, values in self._new.items():
+            rows = np.array(values).reshape(-1, self.widths[role])
+            self.tables[role] = np.concatenate([self.tables[role], rows])
+            self._new[role] = array.array("d")
+        if any(len(self.tables[role]) > MAX_ROWS for role in self.tables):
+            raise InputError(
+                f"{self.path}: more than {MAX_ROWS} obstacle states in a few minutes: "
+                "expected one drive"
+            )
+        if self._since == -math.inf:
             self.settle()
         clock = np.concatenate([self.clock(role) for role in self.in_use])
         if not clock.size:
@@ -130,44 +189,136 @@ class Drive:
                 "backwards; expected one drive, its files in order"
             )
 
-    def next_place(self, since: float) -> float:
-        """Returns the time [s] of the first place from a time on; inf without one."""
-        clock = np.concatenate([self.clock(role) for role in self.places])
-        return float(np.min(clock, where=clock >= since, initial=math.inf))
+    def _tables(self, low: float, high: float) -> dict[str, np.ndarray]:
+        """Rows by role between two times [s]."""
+        return {
+            role: table[self.between(role, low, high)]
+            for role, table in self.tables.items()
+        }
 
-    def view(self, low: float, high: float) -> Self:
-        """Returns rows from one time [s] to before another, notes since the last."""
-        view, self.notes = copy.copy(self), []
-        view.tables = {role: self._rows(role, low, high) for role in self.tables}
-        return view
-
-    def forget(self, before: float) -> None:
-        """Drops rows from before a time [s]."""
-        self.tables = {role: self._rows(role, before) for role in self.tables}
-        self._since = before
-
-    def _rows(self, role: str, low: float, high: float = math.inf) -> np.ndarray:
-        """Rows between two times [s]; a state that was in force at the first, too."""
-        table, clock = self.tables[role], self.clock(role)
+    def between(self, role: str, low: float, high: float) -> np.ndarray:
+        """Returns which rows [n] of a role count between two times [s]."""
+        clock = self.clock(role)
         kept = (clock >= low) & (clock < high)
-        if role == self.driver_role and (clock < low).any():
+        if role == "driver" and (clock < low).any():  # the mode then in force
             kept[np.argmax(np.where(clock < low, clock, -np.inf))] = True
-        return table[kept]
+        return kept
+
+    # ------------------------------------------------------------------- windows
+
+    def recordings(self) -> Iterator[Recording]:
+        """Yields the drive's recording, or each window's once what it needs is read."""
+        found = False
+        for made in self._windows():
+            found = True
+            yield validate_recording(made, self.path)
+        if not found:
+            what = f"tracks: none on a clock of {clock_rate(self.spec):g} Hz"
+            expected = "a longer drive"
+            if math.isnan(self.start):
+                what, expected = "no places of the ego, nor obstacles", "one of them"
+            raise InputError(f"{self.path}: {what}: expected {expected}")
+
+    def _windows(self) -> Iterator[Recording]:
+        number, window = 0, longest_window(self.spec)
+        needed = long_logs.AFTER_S + LATE_S  # s of what comes after a window
+        windows = Windows(self.name, self.group)
+
+        def take(high: float) -> Iterator[Recording]:
+            """The window up to a time [s], if anybody is there."""
+            within = (number * window, high)
+            if (made := self._recording(within, around(within))) is not None:
+                yield windows.recording(made, number, within, self.progress)
+
+        def following(last: float) -> int:
+            """The next window near a place, or else the one at a time [s]."""
+            places = ("ego", *self.obstacles)
+            clock = np.concatenate([self.clock(role) for role in places])
+            since = (number + 1) * window - MAX_GAP_S
+            near = float(np.min(clock, where=clock >= since, initial=math.inf))
+            near = min(near - MAX_GAP_S, last)
+            return max(number + 1, math.floor(near / window))
+
+        for _ in self._pieces():
+            while self.now > (number + 1) * window + needed:
+                yield from take((number + 1) * window)
+                number = following(self.now - needed)
+                self._since = around((number * window, 0.0))[0]
+                self.tables = self._tables(self._since, math.inf)
+        if number == 0 and self.end <= window:
+            made = self._recording(*[(-math.inf, math.inf)] * 2)
+            yield from [] if made is None else [made]
+            return
+        while number * window < self.end:
+            high = (number + 1) * window
+            yield from take(self.end + 1.0 if self.end <= high else high)
+            number = following(self.end)
+
+    def _recording(
+        self, within: tuple[float, float], held: tuple[float, float]
+    ) -> Recording | None:
+        """The recording of the rows between two times [s]; None: nobody is there.
+
+        Args:
+          within: s, when its scenes begin.
+          held: s, of the rows.
+        """
+        view, self.notes = copy.copy(self), []
+        view.tables = self._tables(*held)
+        return view.recording(within)
+
+    def recording(self, within: tuple[float, float]) -> Recording | None:
+        """Makes the recording of all rows; its scenes begin within two times [s]."""
+        spec, (source, licence, limit) = self.spec, self.usual
+        others, notes = self._others()
+        tracks = [*self._ego(), *others]
+        if not any(t.t[0] < within[1] and t.t[-1] >= within[0] for t in tracks):
+            return None
+        x, y, origin, tracks = placed(tracks)
+        fields, more = self.surroundings(tracks, within, (x, y, origin))
+        clock, by_hand = self.clock("driver"), self.tables["driver"][:, 1]
+        inside = by_hand[(clock >= within[0]) & (clock < within[1])]
+        if inside.size and not inside.all():
+            share = f"{1.0 - float(np.mean(inside)):.0%} of the time"
+            notes = [f"{share} not {self.by_hand}: the ego is no human there", *notes]
+        if not len(self.tables[self.in_use[1]]):
+            notes = ["no obstacles recorded; the ego is alone", *notes]
+        if not len(self.tables["ego"]):
+            notes = ["no places of the ego recorded; no ego track", *notes]
+        return Recording(
+            name=self.name,
+            source=str(spec.get("source", source)),
+            licence=str(spec.get("licence", licence)),
+            rate_hz=clock_rate(spec),
+            default_speed_limit=positive(spec, "speed_limit", limit),
+            notes=(*self.notes, *notes, *origin_notes(origin), *more),
+            **{"tracks": tuple(tracks), **fields},
+        )
 
     # ------------------------------------------------------- rows become tracks
 
-    def driver_spans(self) -> tuple[tuple[float, float], ...]:
-        """Returns when nobody drove by hand, or nothing was said of it.
+    def _ego(self) -> list[Track]:
+        """The recording car's track, moved from its rear axle to its centre."""
+        t, (x, y, heading, speed) = self.clock("ego"), self.tables["ego"][:, 1:5].T
+        poses = np.stack([x, y, heading], axis=1)
+        check_coordinates(self.path, "ego", ("x", "y", "heading"), poses)
+        clock, measured = self.clock("velocity"), self.tables["velocity"][:, 1]
+        lost, known = ~np.isfinite(speed), np.isfinite(measured)
+        if lost.any() and np.count_nonzero(known) > 1:  # measured apart from the poses
+            order = np.flatnonzero(known)[np.argsort(clock[known], kind="stable")]
+            measured = np.interp(t, clock[order], measured[order])
+            speed = np.where(lost, measured, speed)
+        boxes = ego_boxes(self.spec, self.car, t, x, y, heading, speed)
+        return self._tracks(boxes, self._driver_spans())[0]
 
-        The first mode was in force before; () without any message. A row of the role
-        "driver" ends with 1 where a human drives.
+    def _driver_spans(self) -> tuple[tuple[float, float], ...]:
+        """When nobody drove by hand, or nothing was said of it.
+
+        The first mode was in force before; without any the source TOML says who drove.
         """
-        clock, by_hand = (
-            self.clock(self.driver_role),
-            self.tables[self.driver_role][:, -1],
-        )
+        clock, by_hand = self.clock("driver"), self.tables["driver"][:, 1]
         if not clock.size:
-            return ()
+            return recording_car({"recording_car": "human", **self.spec})
         order = np.argsort(clock, kind="stable")
         clock, other = clock[order], by_hand[order] == 0.0
         silent = np.diff(clock, append=np.inf) > MAX_SILENCE_S
@@ -176,105 +327,35 @@ class Drive:
             np.concatenate([other[:1], other, np.ones(np.count_nonzero(silent), bool)]),
         )
 
-    def driver_notes(self, within: tuple[float, float], mode: str) -> list[str]:
-        """Notes how much of the time between two [s] is not driven in a mode."""
-        clock, by_hand = (
-            self.clock(self.driver_role),
-            self.tables[self.driver_role][:, -1],
-        )
-        inside = by_hand[(clock >= within[0]) & (clock < within[1])]
-        share = 1.0 - float(np.mean(inside)) if inside.size else 0.0
-        words = f"{share:.0%} of the time not {mode}: the ego is no human there"
-        return [words] if share > 0.0 else []
+    def _others(self) -> tuple[list[Track], list[str]]:
+        """Tracks of the obstacles, and notes on what was left out.
 
-    def ego_tracks(
-        self,
-        spec: Mapping,
-        car: Mapping[str, float],
-        poses: np.ndarray,
-        velocity: tuple[np.ndarray, np.ndarray],
-        automated: tuple[tuple[float, float], ...],
-    ) -> list[Track]:
-        """Makes the recording car's track, moved from its rear axle to its centre.
-
-        Args:
-          spec: source TOML.
-          car: its usual measures, see `ego_boxes`.
-          poses: [n, 4] x, y, heading, speed at `clock` of the first role.
-          velocity: times [m] s and speeds [m] m/s that were measured apart from poses.
-          automated: of the track.
+        A heading that is not known is the direction of travel.
         """
-        t, (x, y, heading, speed) = self.clock(self.places[0]), poses.T
-        lost, known = ~np.isfinite(speed), np.isfinite(velocity[1])
-        if lost.any() and np.count_nonzero(known) > 1:
-            clock, measured = velocity[0][known], velocity[1][known]
-            order = np.argsort(clock, kind="stable")
-            measured = np.interp(t, clock[order], measured[order])
-            speed = np.where(lost, measured, speed)
-        boxes = ego_boxes(spec, car, t, x, y, heading, speed)
-        return self.tracks(boxes, spec, automated)[0]
+        role = self.in_use[1]
+        table = self.tables[role].copy()
+        table[:, 0] = self.clock(role)
+        table, notes = self.selected(table)
+        check_coordinates(self.path, "obstacles", ("x", "y"), table[:, 2:4])
+        numbers, ids = np.unique(table[:, 1].astype(np.int64), return_inverse=True)
+        t, _, x, y, heading, speed, length, width, kind = table[:, :9].T
+        for user in np.unique(ids[np.isnan(heading)]):
+            mine = np.flatnonzero(ids == user)
+            mine = mine[np.argsort(t[mine], kind="stable")]
+            travel = travel_heading(t[mine], x[mine], y[mine])
+            heading[mine] = np.where(np.isnan(heading[mine]), travel, heading[mine])
+        names, kinds = [self.name_of(n) for n in numbers.tolist()], kind.astype(int)
+        boxes = Boxes(ids, names, t, x, y, heading, speed, length, width, kinds)
+        tracks, left_out = self._tracks(boxes)
+        return tracks, [*notes, *left_out]
 
-    def tracks(
-        self,
-        boxes: Boxes,
-        spec: Mapping,
-        automated: tuple[tuple[float, float], ...] = (),
+    def _tracks(
+        self, boxes: Boxes, automated: tuple[tuple[float, float], ...] = ()
     ) -> tuple[list[Track], list[str]]:
-        """Puts boxes onto the recording's clock; returns their tracks, with notes."""
-        boxes = on_clock(boxes, clock_rate(spec), MAX_GAP_S)
-        unknown = str(spec.get("unknown", "auto"))
+        """Tracks of boxes on the recording's clock, with notes."""
+        boxes = on_clock(boxes, clock_rate(self.spec), MAX_GAP_S)
+        unknown = str(self.spec.get("unknown", "auto"))
         return tracks_of(self.path, boxes, MAX_GAP_S, unknown, automated)
-
-
-SomeDrive = TypeVar("SomeDrive", bound=Drive)
-
-
-def drive_windows(
-    drive: SomeDrive,
-    batches: Iterable[Rows],
-    windows: "Windows",
-    window: float,
-    make: Callable[[SomeDrive, tuple[float, float]], Recording | None],
-) -> Iterator[Recording]:
-    """Makes recordings of a drive, each once what it needs is read.
-
-    Args:
-      drive: without rows.
-      batches: rows in the order of recording.
-      windows: names and numbers the windows of a long drive.
-      window: s, the longest; a drive that is not longer is one recording.
-      make: view and the times [s] that scenes begin within -> a recording; None:
-        nobody is there.
-    """
-    number = 0
-
-    def take(low: float, high: float) -> Iterator[Recording]:
-        made = make(drive.view(*around((low, high))), (low, high))
-        if made is not None:
-            yield windows.recording(made, number, (low, high), drive.progress)
-
-    def following(last: float) -> int:
-        """Returns the next window near a place, or else the one at a time [s]."""
-        gap = windows.max_gap_s
-        near = drive.next_place((number + 1) * window - gap) - gap
-        return max(number + 1, math.floor(min(near, last) / window))
-
-    _, needed = around((0.0, 0.0))  # s of what comes after a window
-    for rows in batches:
-        drive.add(rows)
-        while drive.now > (number + 1) * window + needed + LATE_S:
-            yield from take(number * window, (number + 1) * window)
-            number = following(drive.now - LATE_S - needed)
-            drive.forget(around((number * window, 0.0))[0])
-    if number == 0 and drive.end <= window:
-        whole = (-math.inf, math.inf)
-        made = make(drive.view(*whole), whole)
-        yield from [] if made is None else [made]
-        return
-    while (low := number * window) < drive.end:
-        is_last = drive.end <= low + window
-        yield from take(low, drive.end + 1.0 if is_last else low + window)
-        number = following(drive.end)
 
 
 def longest_window(spec: Mapping) -> float:
@@ -299,11 +380,10 @@ class Windows:
     Args:
       drive: its name.
       group: vehicle-disjoint group of all its windows.
-      max_gap_s: a road user unseen for longer is another track.
     """
 
-    def __init__(self, drive: str, group: str, max_gap_s: float = MAX_GAP_S) -> None:
-        self.drive, self.group, self.max_gap_s = drive, group, max_gap_s
+    def __init__(self, drive: str, group: str) -> None:
+        self.drive, self.group = drive, group
         self._starts: dict[str, list[float]] = {}  # s, first seen, and after gaps
         self._last: dict[str, float] = {}  # s
 
@@ -320,10 +400,9 @@ class Windows:
         """
         for track in made.tracks:
             user, first = track.id.partition("#")[0], float(track.t[0])
-            last = self._last.get(user, -np.inf)
-            if first - last > self.max_gap_s:
+            if first - self._last.get(user, -np.inf) > MAX_GAP_S:
                 self._starts.setdefault(user, []).append(first)
-            self._last[user] = max(last, float(track.t[-1]))
+            self._last[user] = max(self._last.get(user, -np.inf), float(track.t[-1]))
         part = long_logs.TimeSlice(
             number=number,
             values={},
@@ -334,15 +413,6 @@ class Windows:
         name = f"{self.drive}-{number:03d}"
         made = dataclasses.replace(made, name=name, group=self.group)
         return part.of_log(self.drive, made)
-
-
-def check_held(where: str, count: int) -> None:
-    """Checks that no more obstacle states than MAX_ROWS are held."""
-    if count > MAX_ROWS:
-        raise InputError(
-            f"{where}: more than {MAX_ROWS} obstacle states in a few minutes: "
-            "expected one drive"
-        )
 
 
 def topics_of(
@@ -366,19 +436,6 @@ def topics_of(
             )
         found[role] = [*every]
     return found
-
-
-def is_anybody(tracks: Iterable[Track], within: tuple[float, float]) -> bool:
-    """True if a road user is there between two times [s]."""
-    return any(t.t[0] < within[1] and t.t[-1] >= within[0] for t in tracks)
-
-
-def no_tracks(first: Path, spec: Mapping) -> InputError:
-    """Makes the error of a drive of which no window has a track."""
-    return InputError(
-        f"{first}: tracks: none on a clock of {clock_rate(spec):g} Hz: expected a "
-        "longer drive"
-    )
 
 
 def clock_rate(spec: Mapping) -> float:

@@ -271,49 +271,16 @@ def test_example_record_of_apollo(data_dir):
     assert has_note(recording, "100% of the time")
 
 
-# ---------------------------------------------------------------- descriptors
-
-ESTIMATE = "apollo.localization.LocalizationEstimate"
-ME = f"header 1 .{ESTIMATE}"  # the message itself, which has what a header needs
-
-
-def estimate(*fields):
-    """Descriptors with a LocalizationEstimate of other fields."""
-    text = f"LocalizationEstimate: {', '.join(['timestamp_sec 9 double', *fields])}"
-    return fixture.described("apollo.localization", text=text)
-
-
-BAD_DESCRIPTORS = [
-    (None, "no descriptors before its first message"),
-    (b"", "LocalizationEstimate: no descriptors"),
-    (b"\xff\xff", "Error parsing message"),
-    (estimate(), "field header: not among the descriptors"),
-    (estimate("header 1 int32"), "Estimate.header: type int32: another is known"),
-    (estimate("header 1 .x.Y*"), "header: type message: another is known"),
-    (estimate("header 1 .x.Y"), "message type x.Y: not among the descriptors"),
-    (estimate(ME, "measurement_time 1 double"), "duplicate field number"),
-    # the depth of what is parsed is that of what is wanted
-    (estimate(ME), "pose: x: nan"),
-]
-
-
-@pytest.mark.parametrize(("desc", "words"), BAD_DESCRIPTORS)
-def test_hostile_descriptors(tmp_path, desc, words):
-    channels = {LOCALIZATION: (ESTIMATE, desc)} if desc is not None else {}
+def test_channels_whose_type_is_not_what_is_read(tmp_path):
+    """A type is checked; one that the record does not name is read as usual."""
+    for channels in ({}, {LOCALIZATION: ("", b"")}):
+        assert only(tmp_path, ego_only(), channels=channels).tracks[0].t.size == 21
+    channels = {LOCALIZATION: ("apollo.drivers.Image", b"")}
     line = refused(only, tmp_path, ego_only(), channels=channels)
-    assert words in line
-    assert "a.record: " in line
-
-
-def test_a_channel_without_descriptors_is_noted(tmp_path):
-    """The others are read; of a record that holds no other one is named."""
-    at = 0.1
-    sent = [(CHASSIS, at, b"\x0d\0\0\0\0"), (CHASSIS, at, b""), *ego_only()]
-    described = fixture.CHANNELS | {CHASSIS: ("apollo.canbus.Chassis", b"")}
-    made = only(tmp_path, sent, channels=described)
-    assert made.tracks[0].t.size == 21
-    (note,) = [note for note in made.notes if CHASSIS in note]
-    assert note.endswith("no descriptors; who drove is not known")
+    assert line.endswith(
+        f"a.record: {LOCALIZATION}: message 0: type 'apollo.drivers.Image': expected "
+        "LocalizationEstimate"
+    )
 
 
 def test_of_a_silent_chassis_nobody_knows_the_mode(tmp_path):

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from rcirl_jax.data.formats.apollo import messages as apollo_messages
+from rcirl_jax.data.formats import messages
 from rcirl_jax.data.formats.apollo import reader as apollo
 from tests.data.formats.fixtures import apollo as fixture
 from tests.data.formats.test_apollo import (
@@ -24,18 +24,18 @@ from tests.helpers.logs import refused, tracks_of
 
 def long_drive(seconds=100.0):
     """Two cars ahead; one is hidden from 45 to 47 s, across a border of windows."""
-    messages = [(ROUTING, 0.0, fixture.routing(*place(0)))]
+    sent = [(ROUTING, 0.0, fixture.routing(*place(0)))]
     if seconds > 61.0:
-        messages.append((ROUTING, 61.0, fixture.routing(*place(900))))
+        sent.append((ROUTING, 61.0, fixture.routing(*place(900))))
     for k in range(round(10 * seconds) + 1):
         t = 0.1 * k
-        messages.append((LOCALIZATION, t, fixture.localization(t)))
+        sent.append((LOCALIZATION, t, fixture.localization(t)))
         seen = ["12"] if 45.0 < t < 47.0 else ["12", "17"]
         users = fixture.road_users(np.array([t]))
         items = [fixture.obstacle(name, users[name], t) for name in seen]
         content = fixture.perceived(t, items)
-        messages.append((PERCEPTION, t + fixture.LATE_S, content))
-    return sorted(messages, key=lambda item: item[1])
+        sent.append((PERCEPTION, t + fixture.LATE_S, content))
+    return sorted(sent, key=lambda item: item[1])
 
 
 @pytest.fixture(scope="module")
@@ -47,14 +47,14 @@ def long():
 @pytest.fixture
 def in_pieces(monkeypatch):
     """Rows are handed on every five seconds."""
-    monkeypatch.setattr(apollo_messages, "PIECE_S", 5.0)
+    monkeypatch.setattr(messages, "PIECE_S", 5.0)
 
 
-def in_parts(folder, messages, count):
+def in_parts(folder, sent, count):
     """Files of a drive; the first."""
-    size = -(-len(messages) // count)
+    size = -(-len(sent) // count)
     for part in range(count):
-        some = messages[part * size : (part + 1) * size]
+        some = sent[part * size : (part + 1) * size]
         write(folder / f"a.record.{part:05d}", some)
     return folder / "a.record.00000"
 
@@ -95,30 +95,30 @@ def test_windows_are_made_while_parts_are_read_in_order(tmp_path, long):
 @pytest.mark.parametrize("piece", [5.0, 1e9])
 def test_a_long_silence_is_stepped_over(tmp_path, monkeypatch, silence, piece):
     """What is held is not looked at once for every second of it."""
-    monkeypatch.setattr(apollo_messages, "PIECE_S", piece)
-    looked_at, recording = [], apollo._recording
+    monkeypatch.setattr(messages, "PIECE_S", piece)
+    looked_at, recording = [], messages.Drive.recording
     monkeypatch.setattr(
-        apollo,
-        "_recording",
-        lambda held, *rest: looked_at.append(rest) or recording(held, *rest),
+        messages.Drive,
+        "recording",
+        lambda held, within: looked_at.append(within) or recording(held, within),
     )
     times = [start + 0.1 * k for start in (0.0, silence) for k in range(9)]
-    messages = [(LOCALIZATION, t, fixture.localization(t)) for t in times]
-    found = read(write(tmp_path / "a.record", messages), window_s=1.0)
+    sent = [(LOCALIZATION, t, fixture.localization(t)) for t in times]
+    found = read(write(tmp_path / "a.record", sent), window_s=1.0)
     assert [made.name for made in found] == ["a-000", f"a-{silence:.0f}"]
     assert len(looked_at) < 10
 
 
 def test_rows_held_are_limited(tmp_path, monkeypatch):
-    monkeypatch.setattr("rcirl_jax.data.formats.messages.MAX_ROWS", 100)
+    monkeypatch.setattr(messages, "MAX_ROWS", 100)
     line = refused(read, in_parts(tmp_path, long_drive(8.0), 1))
     assert "more than 100 obstacle states" in line
 
 
 def test_a_mode_that_was_said_long_ago_is_not_known(tmp_path):
     """Windows that hold no message of the chassis."""
-    messages = [(CHASSIS, 0.0, fixture.chassis(0.0, manual=False)), *long_drive(60.0)]
-    found = read(write(tmp_path / "a.record.00000", messages), window_s=20.0)
+    sent = [(CHASSIS, 0.0, fixture.chassis(0.0, manual=False)), *long_drive(60.0)]
+    found = read(write(tmp_path / "a.record.00000", sent), window_s=20.0)
     egos = [one for made in found for one in made.tracks if one.id.startswith("ego")]
     assert len(found) == len(egos) == 3
     assert not any(ego.is_human(ego.t[0], ego.t[-1]) for ego in egos)

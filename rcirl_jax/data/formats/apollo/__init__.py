@@ -1,6 +1,6 @@
-"""Apollo cyber records: `records` is the file, `messages` its content.
+"""Apollo cyber records: `records` is the file, `reader` makes recordings of it.
 
-A new channel or message field is read in `messages`; `reader` makes recordings of it.
+A new channel or message field is read in `reader`.
 """
 
 from rcirl_jax.data.formats.format import Format

@@ -2,10 +2,10 @@
 
 Read: `*.record`, `*.record.00000`, `.00001`, ... of Apollo 3.5 and later; the
 parts of one drive make one Recording, or one per window of a long drive, made
-while they are read. Messages are decoded by the descriptors in
-the record (modules/common_msgs in the Apollo sources: localization.proto,
-chassis.proto, perception_obstacle.proto, prediction_obstacle.proto,
-routing.proto), so no Apollo package is needed.
+while they are read. Messages are parsed by the numbers of their fields, which are
+the same in all releases (modules/common_msgs in the Apollo sources:
+localization.proto, chassis.proto, perception_obstacle.proto,
+prediction_obstacle.proto, routing.proto, planning_command.proto).
 
 Traps: a pose is that of the rear axle's centre, not of the box; the quaternion's
 zero is north, the heading's is east; messages are irregular and on clocks of
@@ -13,48 +13,165 @@ their own, so everything is put on one uniform clock; where perception recorded
 nothing, prediction repeats its obstacles; a drive may be the planner's own, not
 a human's (a note says how much of it); a drive may have several destinations,
 and the ego is another track from each new one on.
+
+A new field of a message stands in SCHEMA, a new channel or message in TOPICS.
 """
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from operator import attrgetter
 from pathlib import Path
-from typing import Self
+from typing import Any, NamedTuple
 
 import numpy as np
+from google.protobuf.message import DecodeError
 
-from rcirl_jax.data.formats.apollo.messages import (
-    LOCALIZATION,
-    MANUAL,
-    OBSTACLES,
-    WIDTHS,
-    read_drive,
-)
-from rcirl_jax.data.formats.apollo.records import Run, first_parts
+from rcirl_jax.data.formats.apollo.records import Record, Run, check_size, first_parts
 from rcirl_jax.data.formats.files import log_name
-from rcirl_jax.data.formats.messages import (
-    Drive,
-    Windows,
-    clock_rate,
-    drive_windows,
-    is_anybody,
-    longest_window,
-    no_tracks,
-)
-from rcirl_jax.data.formats.options import one_pattern, positive
-from rcirl_jax.data.formats.perception import Boxes, fitted_lanes, placed
-from rcirl_jax.data.formats.shapes import check_coordinates, origin_notes
-from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.formats.messages import Drive, Row, topics_of
+from rcirl_jax.data.formats.options import one_pattern
+from rcirl_jax.data.formats.perception import UNKNOWN
+from rcirl_jax.data.readers.protobuf import Message, parsers
+from rcirl_jax.data.readers.reading import reading
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Recording, Track
+from rcirl_jax.types import Kind, Recording, Track
 
-LIMIT_MPS = 29.06  # m/s, 65 mph
-# Lincoln MKZ in Apollo's mkz_example: 3.89 m before, 1.043 m behind the rear axle
-EGO = {"length": 4.933, "width": 2.11, "rear_axle_to_centre": 1.4235}  # m
+# the fields that are read; whole numbers and enums are int64, as coded they are alike
+SCHEMA = """
+Header: timestamp_sec 1 double
+Point: x 1 double=nan, y 2 double=nan
+Quaternion: qx 1 double=nan, qy 2 double=nan, qz 3 double=nan, qw 4 double=nan
+Pose: position 1 Point, orientation 2 Quaternion, linear_velocity 3 Point,\
+ heading 6 double=nan
+LocalizationEstimate: header 1 Header, pose 2 Pose, measurement_time 4 double
+Chassis: speed_mps 5 float=nan, driving_mode 21 int64, header 25 Header
+PerceptionObstacle: id 1 int64, position 2 Point, theta 3 double, velocity 4 Point,\
+ length 5 double, width 6 double, type 10 int64, timestamp 11 double
+PerceptionObstacles: perception_obstacle 1 PerceptionObstacle*, header 2 Header
+PredictionObstacle: perception_obstacle 1 PerceptionObstacle
+PredictionObstacles: header 1 Header, prediction_obstacle 2 PredictionObstacle*
+LaneWaypoint: pose 3 Point
+RoutingRequest: waypoint 2 LaneWaypoint*
+RoutingResponse: routing_request 4 RoutingRequest
+PlanningCommand: lane_follow_command 3 RoutingResponse
+"""
+PARSERS = parsers(SCHEMA)
+MANUAL = 0  # Chassis.DrivingMode of a human driver, COMPLETE_MANUAL
+# PerceptionObstacle.Type: UNKNOWN_UNMOVABLE, PEDESTRIAN, BICYCLE, VEHICLE
+KINDS = {2: Kind.STATIC, 3: Kind.PEDESTRIAN, 4: Kind.CYCLIST, 5: Kind.VEHICLE}
+LOCALIZATION = "/apollo/localization/pose"
 CLOCK_TOLERANCE_S = 1.0  # s, two topics' clocks differ by more: not one clock
 REPEAT_S = 1.5  # s; Apollo sends the routing in force again every second
+# Lincoln MKZ in mkz_example: 3.89 m before, 1.043 m behind the rear axle
+EGO = {"length": 4.933, "width": 2.11, "rear_axle_to_centre": 1.4235}  # m
+OBSTACLES = ("perception", "prediction")
+# role -> columns of its rows, as `Drive` has them, and the time of recording, s
+WIDTHS = {"ego": 6, "velocity": 3, "driver": 3, "perception": 10, "prediction": 10}
+WIDTHS["routing"] = 3  # x, y where a route ends
 
 Leg = tuple[float, tuple[float, float] | None]  # s, from when on; destination, m
+
+
+# --------------------------------------------------------------------- topics
+
+
+_pose = attrgetter(
+    *("header.timestamp_sec", "measurement_time", "pose.position.x", "pose.position.y"),
+    *("pose.heading", "pose.linear_velocity.x", "pose.linear_velocity.y"),
+    *(f"pose.orientation.{name}" for name in ("qx", "qy", "qz", "qw")),
+)
+_mode = attrgetter("header.timestamp_sec", "speed_mps", "driving_mode")
+_obstacle = attrgetter(
+    *("timestamp", "id", "position.x", "position.y", "theta"),
+    *("velocity.x", "velocity.y", "length", "width", "type"),
+)
+
+
+def _stamp(sent: float, own: float) -> float:
+    """The time of measurement, s; that of the header where it is on another clock."""
+    return own if abs(own - sent) <= CLOCK_TOLERANCE_S else sent
+
+
+def _localization(message: Message) -> Iterator[tuple[str, Row]]:
+    sent, own, x, y, heading, vx, vy, qx, qy, qz, qw = _pose(message)
+    if math.isnan(heading):  # the quaternion turns (right, forward, up) from east
+        yaw = math.atan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
+        heading = yaw + 0.5 * math.pi
+    yield "ego", (_stamp(sent, own), x, y, heading, math.hypot(vx, vy))
+
+
+def _chassis(message: Message) -> Iterator[tuple[str, Row]]:
+    sent, speed, mode = _mode(message)
+    yield "velocity", (sent, speed)
+    yield "driver", (sent, float(mode == MANUAL))
+
+
+def _state(role: str, sent: float, obstacle: Message) -> tuple[str, Row]:
+    """A row of an obstacle; NaN: a position, velocity or size that is not recorded."""
+    own, number, x, y, theta, vx, vy, length, width, kind = _obstacle(obstacle)
+    size = length or math.nan, width or math.nan
+    place = _stamp(sent, own), float(number), x, y, theta
+    return role, (*place, math.hypot(vx, vy), *size, float(KINDS.get(kind, UNKNOWN)))
+
+
+def _perceived(message: Message) -> Iterator[tuple[str, Row]]:
+    sent = message.header.timestamp_sec
+    for one in message.perception_obstacle:
+        yield _state("perception", sent, one)
+
+
+def _predicted(message: Message) -> Iterator[tuple[str, Row]]:
+    sent = message.header.timestamp_sec
+    for one in message.prediction_obstacle:
+        if one.HasField("perception_obstacle"):
+            yield _state("prediction", sent, one.perception_obstacle)
+
+
+def _end(message: Message) -> Iterator[tuple[str, Row]]:
+    """Where a route ends, m."""
+    for point in message.routing_request.waypoint[-1:]:
+        x, y = point.pose.x, point.pose.y
+        if math.isfinite(x) and math.isfinite(y):
+            yield "routing", (x, y)
+
+
+class Topic(NamedTuple):
+    """Messages that say the same, on the channels of all releases."""
+
+    message: str  # type, without its package
+    read: Callable[[Message], Iterator[tuple[str, Row]]]  # rows by role
+    channels: tuple[str, ...]
+
+
+TOPICS = {
+    "localization": Topic("LocalizationEstimate", _localization, (LOCALIZATION,)),
+    "chassis": Topic("Chassis", _chassis, ("/apollo/canbus/chassis",)),
+    "perception": Topic(
+        "PerceptionObstacles", _perceived, ("/apollo/perception/obstacles",)
+    ),
+    "prediction": Topic("PredictionObstacles", _predicted, ("/apollo/prediction",)),
+    "routing": Topic(
+        *("RoutingResponse", _end),
+        ("/apollo/routing_response", "/apollo/raw_routing_response"),
+    ),
+    "routing_history": Topic(
+        *("RoutingResponse", _end),
+        (
+            "/apollo/routing_response_history",
+            "/apollo/raw_rrouting_response_history",  # so spelt since Apollo 9
+        ),
+    ),
+    # since Apollo 9; who listens late is given the last of the history
+    "command": Topic(
+        "PlanningCommand",
+        lambda message: _end(message.lane_follow_command),
+        ("/apollo/planning/command", "/apollo/planning_command_history"),
+    ),
+}
+
+
+# --------------------------------------------------------------------- drives
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
@@ -77,99 +194,145 @@ def own_name(first: Path) -> str:
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """Yields one Recording per drive, or per window of a long one, or run of parts."""
     for first in parts(path, spec):
-        run, drive, found = Run(first), ApolloDrive(first), False
-        windows = Windows(log_name(first, spec, run.name), run.drive)
-        for recording in drive_windows(
-            drive,
-            read_drive(run.files, spec),
-            windows,
-            longest_window(spec),
-            lambda view, within, run=run: _recording(view, within, run, spec),
-        ):
-            found = True
-            yield validate_recording(recording, first)
-        if math.isnan(drive.start):
-            raise InputError(
-                f"{first}: {LOCALIZATION}: no messages, nor obstacles: "
-                "expected at least one of them"
-            )
-        if not found:
-            raise no_tracks(first, spec)
+        yield from ApolloDrive(Run(first), spec).recordings()
 
 
 class ApolloDrive(Drive):
     """Rows of a drive, put onto one clock: of measurement, or of recording.
 
-    Column 0 is the time of a message's header, column 1 of its recording; of poses and
-    obstacles column 2 is that of measurement. Where topics are stamped on different
-    clocks, the times of recording are common to all.
+    Where topics are stamped on different clocks, the times of recording, in the last
+    column, are common to all.
+
+    Args:
+      run: its files.
+      spec: source TOML.
     """
 
+    widths = WIDTHS
+    obstacles = OBSTACLES
+    usual = ("Apollo cyber record", "unknown", 29.06)  # m/s, 65 mph
+    car = EGO
     stamp_field = "timestamp_sec"
-    driver_role = "chassis"
+    by_hand = "in COMPLETE_MANUAL"
+    has_no_map = "records hold no map"
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, WIDTHS, ("localization", *OBSTACLES))
+    def __init__(self, run: Run, spec: dict) -> None:
+        name = log_name(run.first, spec, run.name)
+        super().__init__(run.first, spec, name, run.drive)
+        self.run = run
         self._offset = 0.0  # s, what the clock shows less the time of recording
         self._is_one_clock = True
 
-    @property
-    def key(self) -> str:
-        """Returns the role of the obstacles."""
-        return "perception" if len(self.tables["perception"]) else "prediction"
+    def rows(self) -> Iterator[tuple[str, float, float, Row]]:
+        """Yields the rows of all wanted messages in the order of recording."""
+        usual = {name: topic.channels for name, topic in TOPICS.items()}
+        wanted = {
+            channel: TOPICS[name]
+            for name, channels in topics_of(self.spec, usual).items()
+            for channel in channels
+        }
+        files, numbers, done = self.run.files, dict.fromkeys(wanted, 0), 0
+        total = max(sum(file.stat().st_size for file in files if file.is_file()), 1)
+        with reading(self.path, files) as show:
 
-    @property
-    def in_use(self) -> Sequence[str]:
-        """Roles whose rows become tracks."""
-        return "localization", self.key
+            def count(size: int) -> None:
+                nonlocal done
+                done += size
+                show(size)
+
+            for file in files:
+                record = Record(file)
+                for channel, time, content in record.messages(wanted, count):
+                    topic = wanted[channel]
+                    where = f"{file}: {channel}: message {numbers[channel]}"
+                    kind = record.types.get(channel) or topic.message
+                    if kind.rpartition(".")[2] != topic.message:
+                        raise InputError(
+                            f"{where}: type {kind!a:.80}: expected {topic.message}"
+                        )
+                    try:
+                        check_size("message", content)
+                        message = PARSERS[topic.message](bytes(content))
+                    except DecodeError as error:
+                        raise InputError(
+                            f"{where}: {error}: expected an Apollo message"
+                        ) from error
+                    numbers[channel] += 1
+                    recorded, share = time * 1e-9, min(done / total, 1.0)
+                    for role, row in topic.read(message):
+                        yield role, recorded, share, (*row, recorded)
+                if not record.is_complete:
+                    self.notes.append(f"{file.name} was never closed; read to its end")
+
+    def settle(self) -> None:
+        """Chooses the clock, and where it starts."""
+        ahead = {
+            role: self.tables[role][:, 0] - self.tables[role][:, -1]
+            for role in (*self.in_use, "driver")
+            if len(self.tables[role])
+        }
+        medians = [float(np.median(offsets)) for offsets in ahead.values()]
+        if medians:
+            self._is_one_clock = max(medians) - min(medians) <= CLOCK_TOLERANCE_S
+        super().settle()
+        places = [self.stamps(r) - self.tables[r][:, -1] for r in self.in_use]
+        if not math.isnan(self.start):
+            self._offset = float(np.median(np.concatenate(places)))
+
+    def stamps(self, role: str) -> np.ndarray:
+        """Returns what the clock shows [s] at each row of a role."""
+        return self.tables[role][:, 0 if self._is_one_clock else -1]
 
     @property
     def now(self) -> float:
         """Returns when [s] the last position was recorded; -inf without any held."""
         tables = [self.tables[role] for role in self.in_use]
-        recorded = [table[-1, 1] for table in tables if len(table)]
+        recorded = [table[-1, -1] for table in tables if len(table)]
         return max(recorded, default=-math.inf) + self._offset - self.start
 
-    def settle(self) -> None:
-        """Chooses the clock, and where it starts."""
-        tables = [self.tables[role] for role in (*self.in_use, "chassis")]
-        offsets = [float(np.median(t[:, 0] - t[:, 1])) for t in tables if len(t)]
-        if offsets:
-            self._is_one_clock = max(offsets) - min(offsets) <= CLOCK_TOLERANCE_S
-        super().settle()
-        if not math.isnan(self.start):
-            ahead = [self.stamps(r) - self.tables[r][:, 1] for r in self.in_use]
-            self._offset = float(np.median(np.concatenate(ahead)))
+    def between(self, role: str, low: float, high: float) -> np.ndarray:
+        """Returns which rows [n] count; all routings, which are in force for long."""
+        if role == "routing":
+            return np.ones(len(self.tables[role]), bool)
+        return super().between(role, low, high)
 
-    def stamps(self, role: str) -> np.ndarray:
-        """Returns what the clock shows [s] at each row of a role."""
-        table = self.tables[role]
+    def selected(self, table: np.ndarray) -> tuple[np.ndarray, list[str]]:
+        """Drops states without a position, or of the ego (negative number)."""
+        seen = ~np.isnan(table[:, 2:4]).any(axis=1) & (table[:, 1] >= 0)
+        notes = []
+        if not seen.all():
+            lost = np.count_nonzero(~seen)
+            notes = [f"{lost} obstacle states without position or id left out"]
+        if self.in_use[1] == "prediction" and len(table):
+            notes.append("no perception recorded; obstacles are those of prediction")
+        return table[seen], notes
+
+    def surroundings(
+        self,
+        tracks: Sequence[Track],
+        within: tuple[float, float],
+        places: tuple[np.ndarray, np.ndarray, np.ndarray],
+    ) -> tuple[dict[str, Any], list[str]]:
+        """Makes lanes of the paths, and legs of the ego's track."""
+        fields, notes = super().surroundings(tracks, within, places)
+        legs = self._legs()
+        fields["tracks"] = tuple(_with_destinations(tracks, legs, places[2]))
+        fields["group"] = self.run.drive if self.run.is_cut else None
+        is_routed = any(start < within[1] and place for start, place in legs)
+        if len(self.tables["ego"]) and not is_routed:
+            notes.append("no routing recorded; the ego's destination is unknown")
         if not self._is_one_clock:
-            return table[:, 1]
-        own = table[:, 0 if role == "chassis" else 2]
-        near = np.abs(own - table[:, 0]) <= CLOCK_TOLERANCE_S
-        return np.where(near, own, table[:, 0])
+            notes.append("topics stamped on different clocks; times of recording used")
+        return fields, notes
 
-    def view(self, low: float, high: float) -> Self:
-        """Returns rows from one time [s] to before another, notes since the last."""
-        view = super().view(low, high)
-        if not self.is_cut and not self._is_one_clock:
-            note = "topics stamped on different clocks; times of recording used"
-            view.notes = [*view.notes, note]
-        return view
-
-    def _rows(self, role: str, low: float, high: float = math.inf) -> np.ndarray:
-        """Rows between two times [s]; all routings, which are in force for long."""
-        every = self.tables[role]
-        return every if role == "routing" else super()._rows(role, low, high)
-
-    def legs(self) -> list[Leg]:
-        """Returns destinations in the order of time, the first valid from the start.
+    def _legs(self) -> list[Leg]:
+        """Destinations in the order of time, the first valid from the start.
 
         A routing that came within REPEAT_S of the start was in force before.
         """
         legs: list[Leg] = [(-math.inf, None)]
-        for time, x, y in sorted(self.tables["routing"].tolist()):
+        table = self.tables["routing"]
+        for x, y, time in table[np.lexsort(table.T)].tolist():
             if (x, y) != legs[-1][1]:
                 legs.append((time + self._offset - self.start, (x, y)))
         while len(legs) > 1 and legs[1][0] <= (REPEAT_S if legs[0][1] is None else 0.0):
@@ -177,74 +340,8 @@ class ApolloDrive(Drive):
         return legs
 
 
-def _recording(
-    drive: ApolloDrive, within: tuple[float, float], run: Run, spec: dict
-) -> Recording | None:
-    """The tracks of the rows held, with notes on the time within; None: nothing."""
-    obstacles, obstacle_notes = _obstacles(drive, spec)
-    tracks = [*_ego(drive, spec), *obstacles]
-    if not is_anybody(tracks, within):
-        return None
-    legs, missing = drive.legs(), []
-    if not len(drive.tables["localization"]):
-        missing.append("no localization recorded; no ego track")
-    elif not any(start < within[1] and place for start, place in legs):
-        missing.append("no routing recorded; the ego's destination is unknown")
-    if not len(drive.tables[drive.key]):
-        missing.append("no obstacles recorded; the ego is alone")
-    elif drive.key == "prediction":
-        missing.append("no perception recorded; obstacles are those of prediction")
-    _, _, origin, tracks = placed(tracks)
-    lanes, lanes_note = fitted_lanes(tracks, spec)
-    return Recording(
-        name=log_name(run.first, spec, run.name),
-        group=run.drive if run.is_cut else None,
-        source=str(spec.get("source", "Apollo cyber record")),
-        licence=str(spec.get("licence", "unknown")),
-        rate_hz=clock_rate(spec),
-        tracks=tuple(_with_destinations(tracks, legs, origin)),
-        lanes=lanes,
-        default_speed_limit=positive(spec, "speed_limit", LIMIT_MPS),
-        notes=(
-            *drive.notes,
-            *missing,
-            *drive.driver_notes(within, f"in {MANUAL}"),
-            *obstacle_notes,
-            *origin_notes(origin),
-            f"records hold no map; {lanes_note}",
-        ),
-    )
-
-
-def _ego(drive: ApolloDrive, spec: dict) -> list[Track]:
-    """The ego's track; without a chassis channel a human drives."""
-    poses = drive.tables["localization"][:, 3:]
-    where = f"{drive.path}: {LOCALIZATION}"
-    check_coordinates(where, "pose", ("x", "y", "heading"), poses[:, :3])
-    velocity = drive.clock("chassis"), drive.tables["chassis"][:, 2]
-    return drive.ego_tracks(spec, EGO, poses, velocity, drive.driver_spans())
-
-
-def _obstacles(drive: ApolloDrive, spec: dict) -> tuple[list[Track], list[str]]:
-    table, clock = drive.tables[drive.key], drive.clock(drive.key)
-    # a state without a position, or of the ego (negative id), is none
-    seen = ~np.isnan(table[:, 4:6]).any(axis=1) & (table[:, 3] >= 0)
-    lost = int(np.count_nonzero(~seen))
-    table, clock = table[seen], clock[seen]
-    where = f"{drive.path}: obstacles"
-    check_coordinates(where, "perception_obstacle", ("x", "y", "theta"), table[:, 4:7])
-    number_of, ids = np.unique(table[:, 3].astype(np.int64), return_inverse=True)
-    names, kinds = [*map(str, number_of.tolist())], table[:, 10].astype(np.int64)
-    x, y, heading, speed, length, width = table[:, 4:10].T
-    boxes = Boxes(ids, names, clock, x, y, heading, speed, length, width, kinds)
-    tracks, notes = drive.tracks(boxes, spec)
-    if lost:
-        notes.append(f"{lost} obstacle states without position or id left out")
-    return tracks, notes
-
-
 def _with_destinations(
-    tracks: list[Track], legs: list[Leg], origin: np.ndarray
+    tracks: Sequence[Track], legs: list[Leg], origin: np.ndarray
 ) -> Iterator[Track]:
     """The tracks, the ego's cut where a routing set another destination.
 

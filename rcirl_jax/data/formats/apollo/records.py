@@ -3,27 +3,28 @@
 Layout: cyber/proto/record.proto and cyber/record/file in the Apollo sources. A
 file is a row of sections, each with a head of 16 bytes (type int32, 4 bytes
 unused, size int64). The header's section takes 2048 bytes, however short the
-header is. Channels bring the descriptors of their messages. Chunk bodies hold
-the messages. The index at the end is not needed: sections are walked from the
-start, so records that were never closed can be read as well.
+header is. Channels bring the type of their messages, chunk bodies hold the
+messages. The index at the end is not needed: sections are walked from the start,
+so records that were never closed can be read as well.
 """
 
 import mmap
 import re
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 from google.protobuf.message import DecodeError
 
 from rcirl_jax.data.formats.files import files_below
-from rcirl_jax.data.readers.protobuf import parser, table_of
+from rcirl_jax.data.readers.protobuf import parsers
 from rcirl_jax.errors import InputError
 
 HEAD = struct.Struct("<i4xq")  # type and size of a section
 HEADER_BYTES = 2048  # bytes that the header's section takes
 HEADER, CHUNK_HEADER, CHUNK_BODY, INDEX, CHANNEL = range(5)
-MAX_BYTES = 16 * 1024**2  # bytes of a message, or of a channel's descriptors
+MAX_BYTES = 16 * 1024**2  # bytes of a message, or of what is said of a channel
 VARINT, LENGTH = 0, 2  # wire types
 SIZES = {1: 8, 5: 4}  # bytes of those of one size
 # NAME.record, or a part .record.00000; some releases add when it began, .112907, and
@@ -32,9 +33,12 @@ NAME = re.compile(
     r"[^/]+?\.record(?:\.(?P<part>\d{1,9})(?:\.\d{1,20})?)?(?:\.(?:split|recover))?"
 )
 
-CHANNEL_FIELDS = "name 1 string, message_type 2 string, proto_desc 3 bytes"
-read_header = parser(table_of("Header: compress 3 int64, is_complete 13 bool"))
-read_channel = parser(table_of(f"Channel: {CHANNEL_FIELDS}"))
+PARSERS = parsers(
+    """
+Header: compress 3 int64, is_complete 13 bool
+Channel: name 1 string, message_type 2 string
+"""
+)
 
 
 class Run:
@@ -95,22 +99,19 @@ class Record:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        # channel -> (message type, its descriptors: a ProtoDesc)
-        self.channels: dict[str, tuple[str, bytes]] = {}
+        self.types: dict[str, str] = {}  # channel -> type of its messages
         self.is_complete = True
 
     def _error(self, field: str, found: object, expected: str) -> InputError:
         return InputError(f"{self.path}: {field}: {found}: expected {expected}")
 
     def messages(
-        self,
-        wanted: Callable[[str], bool],
-        show: Callable[[int], object] = lambda _: None,
+        self, wanted: Container[str], show: Callable[[int], object] = lambda _: None
     ) -> Iterator[tuple[str, int, memoryview]]:
         """Yields (channel, time ns, content) of the messages on the wanted channels.
 
         Args:
-          wanted: whether a channel is.
+          wanted: names of channels.
           show: called with the bytes of each section that has been read.
         """
         try:
@@ -121,13 +122,12 @@ class Record:
         try:
             for kind, section in self._sections(memoryview(whole)):
                 if kind == CHANNEL:
-                    check_size("descriptors", section)
-                    channel = read_channel(bytes(section))
-                    own = (channel.message_type, channel.proto_desc)
-                    self.channels[channel.name] = own
+                    check_size("channel", section)
+                    channel = PARSERS["Channel"](bytes(section))
+                    self.types[channel.name] = channel.message_type
                 elif kind == CHUNK_BODY:
                     for number, value in _fields(section):
-                        if number == 1 and wanted((sent := _message(value))[0]):
+                        if number == 1 and (sent := _message(value))[0] in wanted:
                             yield sent
                 show(len(section))
         except DecodeError as error:
@@ -137,41 +137,32 @@ class Record:
 
     def _sections(self, data: memoryview) -> Iterator[tuple[int, memoryview]]:
         """(type, content) of the sections behind the header, up to the index."""
-        at, end = 0, len(data)
-        while at < end:
-            kind, size = -1, HEAD.size
+        at, end = HEAD.size + HEADER_BYTES, len(data)
+        kind, size = HEAD.unpack_from(data) if end >= at else (-1, end)
+        if kind != HEADER or not 0 <= size <= HEADER_BYTES:
+            found = f"type {kind}, {size} bytes"
+            raise self._error("header", found, "that of a cyber record")
+        header = PARSERS["Header"](bytes(data[HEAD.size : HEAD.size + size]))
+        if header.compress != 0:
+            expected = "0, none (no Apollo release writes compressed chunks)"
+            raise self._error("header: compress", header.compress, expected)
+        self.is_complete = header.is_complete
+        while (
+            at < end and kind != INDEX
+        ):  # the last; the rest is of a file written over
+            size, where = HEAD.size, at
             if size <= end - at:
                 kind, size = HEAD.unpack_from(data, at)
-                if at == 0:
-                    is_whole = HEAD.size + HEADER_BYTES <= end
-                    if kind != HEADER or not 0 <= size <= HEADER_BYTES or not is_whole:
-                        found = f"type {kind}, {size} bytes"
-                        raise self._error("header", found, "that of a cyber record")
-                    header = read_header(bytes(data[HEAD.size : HEAD.size + size]))
-                    if header.compress != 0:
-                        expected = (
-                            "0, none (no Apollo release writes compressed chunks)"
-                        )
-                        where = "header: compress"
-                        raise self._error(where, header.compress, expected)
-                    self.is_complete = header.is_complete
-                    at = HEAD.size + HEADER_BYTES
-                    continue
                 at += HEAD.size
                 if not HEADER < kind <= CHANNEL or size < 0:
-                    raise self._error(
-                        f"section at byte {at - HEAD.size}",
-                        f"type {kind}, {size} bytes",
-                        "type 1 to 4",
-                    )
+                    found, expected = f"type {kind}, {size} bytes", "type 1 to 4"
+                    raise self._error(f"section at byte {where}", found, expected)
             if size > end - at:
-                where = f"section at byte {at}: beyond the end at {end}"
-                expected = "expected a whole record; truncated?"
-                raise InputError(f"{self.path}: {where}: {expected}")
+                found = f"{size} bytes of {end - at} left"
+                expected = "a whole record; truncated?"
+                raise self._error(f"section at byte {where}", found, expected)
             yield kind, data[at : at + size]
             at += size
-            if kind == INDEX:  # the last; the rest is of a file written over
-                return
 
 
 def check_size(what: str, content: memoryview) -> None:
@@ -182,41 +173,38 @@ def check_size(what: str, content: memoryview) -> None:
 
 def _message(single: int | memoryview) -> tuple[str, int, memoryview]:
     """SingleMessage: channel_name 1, time 2, content 3."""
-    name, time, content = "", 0, memoryview(b"")
-    for number, value in _fields(_bytes(single)):
-        if number == 1:
-            name = bytes(_bytes(value)).decode(errors="replace")
-        elif number == 2 and isinstance(value, int):
-            time = value
-        elif number == 3:
-            content = _bytes(value)
-    return name, time, content
+    found: dict[int, Any] = {1: b"", 2: 0, 3: memoryview(b""), **dict(_fields(single))}
+    name, time, content = found[1], found[2], found[3]
+    if isinstance(name, int) or not isinstance(time, int) or isinstance(content, int):
+        raise DecodeError("message: a number for bytes")
+    return bytes(name).decode(errors="replace"), time, content
 
 
-def _fields(buffer: memoryview) -> Iterator[tuple[int, int | memoryview]]:
+def _fields(buffer: int | memoryview) -> Iterator[tuple[int, int | memoryview]]:
     """(number, value) of a message's whole numbers and bytes; nothing is copied.
 
     By hand: the library copies all pictures and point clouds, in eight times the time.
     """
+    if isinstance(buffer, int):
+        raise DecodeError("message: number: expected bytes")
     at, end = 0, len(buffer)
     while at < end:
         key, at = _varint(buffer, at)
         number, wire = key >> 3, key & 7
+        value, size = None, SIZES.get(wire, 0)
         if wire == VARINT:
             value, at = _varint(buffer, at)
-            yield number, value
-            continue
-        if wire == LENGTH:
+        elif wire == LENGTH:
             size, at = _varint(buffer, at)
-        elif wire in SIZES:
-            size = SIZES[wire]
-        else:
+        elif not size:
             raise DecodeError(f"field {number}: wire type {wire}")
         if size > end - at:
             raise DecodeError(f"field {number}: {size} bytes of {end - at} left")
         if wire == LENGTH:
-            yield number, buffer[at : at + size]
+            value = buffer[at : at + size]
         at += size
+        if value is not None:
+            yield number, value
 
 
 def _varint(buffer: memoryview, at: int) -> tuple[int, int]:
@@ -229,9 +217,3 @@ def _varint(buffer: memoryview, at: int) -> tuple[int, int]:
         if byte < 0x80:
             return value, at + place + 1
     raise DecodeError("varint: no end within ten bytes")
-
-
-def _bytes(value: int | memoryview) -> memoryview:
-    if isinstance(value, int):
-        raise DecodeError("message: number: expected bytes")
-    return value

@@ -21,7 +21,7 @@ from rcirl_jax.data.formats.shapes import (
     limit_of,
     moves,
 )
-from rcirl_jax.data.readers.protobuf import Message, parser, table_of
+from rcirl_jax.data.readers.protobuf import Message, parsers
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import read_json
 from rcirl_jax.runtime.checked import checked
@@ -58,7 +58,7 @@ Light: faces 3 GlobalId*
 Nothing:
 """
 
-read_message = parser(table_of(SCHEMA))
+read_message = parsers(SCHEMA)["MapFragment"]
 
 
 def find_map(folder: Path, spec: dict) -> Path | None:

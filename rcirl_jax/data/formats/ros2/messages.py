@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from operator import attrgetter
 
+from rcirl_jax.data.formats.messages import Row
 from rcirl_jax.data.formats.options import kind_of
 from rcirl_jax.data.formats.perception import STATES, UNKNOWN
 from rcirl_jax.data.formats.ros2.bag import Message
@@ -21,17 +22,9 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 
 NAN = math.nan
-# role -> its columns; t is the header's stamp, s
-COLUMNS = {
-    "ego": ("t", "x", "y", "heading", "speed"),
-    "velocity": ("t", "speed"),
-    "obstacles": (
-        *("t", "id", "x", "y", "heading", "speed", "length", "width", "kind"),
-        "in_base",
-    ),
-    "lights": ("t", "group", "state"),
-    "driver": ("t", "is_manual"),
-}
+# role -> columns of its rows, as `Drive` has them; of lights t [s], group, state; of
+# obstacles there is another: 1 in the ego's frame
+WIDTHS = {"ego": 5, "velocity": 2, "obstacles": 10, "lights": 3, "driver": 2}
 # autoware_vehicle_msgs/ControlModeReport, and autoware_auto_vehicle_msgs of before
 MANUAL = 4
 # colour and status of TrafficLightElement: those of autoware_perception_msgs, and of
@@ -61,7 +54,6 @@ CYLINDER, POLYGON = 1, 2  # Shape.type
 BOX, SPHERE, CONE = 1, 2, 4  # SolidPrimitive.type; 3 is CYLINDER
 HAS_NO_HEADING, HAS_NO_SIGN = 0, 1  # TrackedObjectKinematics.orientation_availability
 
-Row = tuple[float, ...]
 Reader = Callable[[Message, "Context"], Iterator[Row]]
 Pose = tuple[float, float, float]  # x, y [m], heading [rad]; NaN: quaternion not set
 
@@ -74,7 +66,8 @@ class Context:
     map_frame: str
     base_frame: str
     kinds: Mapping[str, str]  # [kinds] of the TOML
-    names: dict[str, int]  # name of an obstacle -> its number in the drive
+    # name of an obstacle -> its number in the drive
+    names: dict[str, int] = dataclasses.field(default_factory=dict)
 
     def check_frame(self, frame: str) -> bool:
         """Returns whether a frame is the ego's own; only the map's is allowed besides.

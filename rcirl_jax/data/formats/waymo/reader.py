@@ -38,7 +38,7 @@ from rcirl_jax.data.formats.shapes import (
 )
 from rcirl_jax.data.formats.tracks import of_one_name
 from rcirl_jax.data.formats.waymo.map import read_map
-from rcirl_jax.data.readers.protobuf import Message, columns, parser, table_of
+from rcirl_jax.data.readers.protobuf import Message, columns, parsers
 from rcirl_jax.data.readers.tfrecord import FRAME_BYTES, read_records
 from rcirl_jax.data.recording import LENGTH_RANGE_M, WIDTH_RANGE_M, accepted
 from rcirl_jax.errors import InputError
@@ -69,7 +69,7 @@ Line: polyline 2 MapPoint*
 StopSign: lane 1 int64*, position 2 MapPoint
 """
 
-read_message = parser(table_of(SCHEMA))
+read_message = parsers(SCHEMA)["Scenario"]
 # what is read of each state
 STATE = (
     *("center_x", "center_y", "length", "width"),
