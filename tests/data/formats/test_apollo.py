@@ -26,7 +26,7 @@ def write(path, messages, **options):
     return path
 
 
-def only(path, messages=None, *, channels=None, **options):
+def only(path, messages=None, *, channels=fixture.CHANNELS, **options):
     """The one recording of a path, or of messages written into a folder."""
     if messages is not None:
         path = write(path / "a.record", messages, channels=channels)
@@ -208,28 +208,28 @@ def destinations(recording):
     }
 
 
-CHANNELS_OF_ROUTES = [
-    *[
-        (name, fixture.CHANNELS[ROUTING], fixture.routing)
-        for name in (
-            *(ROUTING, f"{ROUTING}_history", "/apollo/raw_routing_response"),
-            "/apollo/raw_rrouting_response_history",
-        )
+@pytest.mark.parametrize(
+    ("name", "kind", "make"),
+    [
+        *[
+            (f"/apollo/{name}", fixture.CHANNELS[ROUTING], fixture.routing)
+            for name in (
+                *("routing_response", "routing_response_history"),
+                *("raw_routing_response", "raw_rrouting_response_history"),
+            )
+        ],
+        # Apollo 9 and later; a record from mid-drive has the history alone
+        *[
+            (f"/apollo/{name}", "apollo.planning.PlanningCommand", fixture.command)
+            for name in ("planning/command", "planning_command_history")
+        ],
     ],
-    # Apollo 9 and later; a record from the middle of a drive has the history alone
-    *[
-        (name, fixture.COMMANDS, fixture.command)
-        for name in ("/apollo/planning/command", "/apollo/planning_command_history")
-    ],
-]
-
-
-@pytest.mark.parametrize(("name", "channel", "make"), CHANNELS_OF_ROUTES)
-def test_routing_of_every_release(tmp_path, name, channel, make):
+)
+def test_routing_of_every_release(tmp_path, name, kind, make):
     messages = [(name, 0.3, make(*place(0))), *ego_only(5.0)]
     if make is fixture.command:
         messages.append((name, 3.0, fixture.parking()))
-    channels = {**fixture.CHANNELS, name: channel}
+    channels = {**fixture.CHANNELS, name: kind}
     recording = only(tmp_path, messages, channels=channels)
     assert destinations(recording) == {"ego": place(0)}
     assert not has_note(recording, "no routing")
@@ -273,9 +273,9 @@ def test_example_record_of_apollo(data_dir):
 
 def test_channels_whose_type_is_not_what_is_read(tmp_path):
     """A type is checked; one that the record does not name is read as usual."""
-    for channels in ({}, {LOCALIZATION: ("", b"")}):
+    for channels in ({}, {LOCALIZATION: ""}):
         assert only(tmp_path, ego_only(), channels=channels).tracks[0].t.size == 21
-    channels = {LOCALIZATION: ("apollo.drivers.Image", b"")}
+    channels = {LOCALIZATION: "apollo.drivers.Image"}
     line = refused(only, tmp_path, ego_only(), channels=channels)
     assert line.endswith(
         f"a.record: {LOCALIZATION}: message 0: type 'apollo.drivers.Image': expected "

@@ -1,8 +1,8 @@
 """Bags: which files are one, what topics they have, and their messages as bytes.
 
 A bag is a folder with metadata.yaml, or a file of its own. Of metadata.yaml only the
-list of files and the way of packing are read, line by line: rosbag2 writes one entry a
-line, and so no YAML library is needed. Files are MCAP (https://mcap.dev/spec, read by
+list of files is read, line by line: rosbag2 writes one entry a line, and so no YAML
+library is needed. Files are MCAP (https://mcap.dev/spec, read by
 the library `mcap`; one that was never closed has no magic at its end and is refused,
 because nobody knows how much is missing) or rosbag2's SQLite storage. The definitions
 of messages are in the file; SQLite files from before ROS 2 Iron lack them.
@@ -27,6 +27,8 @@ PATTERNS = ("*.mcap", "*.db3")
 PACKED = (".zstd", ".lz4")  # endings of files that rosbag2 compressed as a whole
 MAGIC = b"\x89MCAP0\r\n"
 MAX_METADATA_BYTES = 64 * 2**20  # bytes; rosbag2 repeats the profiles of each topic
+MAX_MESSAGE_BYTES = 16 * 2**20  # bytes; decoded, a message takes many times its bytes
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 MAX_CHUNK_BYTES = 2**30  # bytes of one chunk of MCAP, unpacked or not
 MAX_SCHEMA_BYTES = 2**20  # bytes of a message's definition; the longest have 50 kB
 MAX_TOPICS = 100_000
@@ -89,16 +91,9 @@ def files_in(bag: Path) -> list[Path]:
             f"{metadata}: {size} bytes: expected at most {MAX_METADATA_BYTES}"
         )
     text = metadata.read_text(errors="replace")
-    mode = re.search(r"^ *compression_mode: *(.*)$", text, re.MULTILINE)
-    if mode and _entry(mode[1]).lower() == "message":
-        raise InputError(
-            f"{metadata}: compression_mode: MESSAGE: expected messages as they were "
-            "sent; unpack them with `ros2 bag convert`"
-        )
     listed = re.search(r"^ *relative_file_paths: *\n((?: *- .*\n?)*)", text, re.M)
-    names = (
-        [_entry(line.strip()[2:]) for line in listed[1].splitlines()] if listed else []
-    )
+    lines = listed[1].splitlines() if listed else []
+    names = [line.strip()[2:].strip().strip("\"'") for line in lines]
     if not names:
         raise InputError(
             f"{metadata}: relative_file_paths: none: expected the files of the bag; "
@@ -115,11 +110,6 @@ def files_in(bag: Path) -> list[Path]:
             )
         files.append(_unpacked(file))
     return files
-
-
-def _entry(text: str) -> str:
-    """A value of YAML without its quotes."""
-    return text.strip().strip("\"'")
 
 
 def _unpacked(file: Path) -> Path:
@@ -269,6 +259,24 @@ def _of_sqlite(database: Database) -> BagFile:
 
 
 # ------------------------------------------------------------------- decoding
+
+
+def as_sent(data: bytes) -> bytes:
+    """Returns a message, unpacked if rosbag2 compressed it by itself.
+
+    Raises:
+      ValueError: it is longer than MAX_MESSAGE_BYTES.
+    """
+    size = len(data)
+    if data.startswith(ZSTD_MAGIC):  # no CDR begins so
+        zstandard = extra_module("zstandard", EXTRA)
+        size = zstandard.frame_content_size(data)
+        if size <= MAX_MESSAGE_BYTES:
+            most = MAX_MESSAGE_BYTES
+            data = zstandard.ZstdDecompressor().decompress(data, max_output_size=most)
+    if size > MAX_MESSAGE_BYTES:
+        raise ValueError(f"{size} bytes of at most {MAX_MESSAGE_BYTES}")
+    return data
 
 
 def decoder_of(path: Path, name: str, topic: Topic) -> Callable[[bytes], Message]:

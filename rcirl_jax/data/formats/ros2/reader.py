@@ -22,6 +22,7 @@ from rcirl_jax.data.formats.messages import MAX_GAP_S, Drive, Row, topics_of
 from rcirl_jax.data.formats.options import section
 from rcirl_jax.data.formats.ros2.bag import (
     Topic,
+    as_sent,
     bags_of,
     decoder_of,
     files_in,
@@ -42,7 +43,6 @@ from rcirl_jax.types import Recording, Track
 # m; Autoware's sample_vehicle (vehicle_info.param.yaml): overhangs 1.0 and 1.1, wheel
 # base 2.79, tread 1.64 and 0.128 on either side
 EGO = {"length": 4.89, "width": 1.896, "rear_axle_to_centre": 1.345}
-MAX_MESSAGE_BYTES = 16 * 2**20  # bytes; decoded, a message takes many times its bytes
 NEEDED = ("ego", "obstacles")
 
 parts = bags_of
@@ -166,11 +166,8 @@ class BagDrive(Drive):
                 self.context.where = f"{path}: {name}: message {numbers[name]}"
                 numbers[name] += 1
                 try:
-                    if len(data) > MAX_MESSAGE_BYTES:
-                        size = len(data)
-                        raise ValueError(f"{size} bytes of at most {MAX_MESSAGE_BYTES}")
-                    read = TYPES[role][kind](decoders[name](data), self.context)
-                    found = [*read]
+                    message = decoders[name](as_sent(data))
+                    found = [*TYPES[role][kind](message, self.context)]
                 except InputError:
                     raise
                 except AttributeError as error:
