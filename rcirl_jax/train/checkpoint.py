@@ -1,9 +1,10 @@
 """Checkpoints by orbax, which only this module imports.
 
-    checkpoints/STEP/              as orbax writes it, under another name until whole
-    checkpoints/STEP/position.json the data position; by this module, then
-    checkpoints/STEP/sha256.json   digests of all its files: it is finished
-    checkpoints/STEP.damaged/      put aside by a run that went on from an older one
+    checkpoints/STEP/             under another name until it is whole
+    checkpoints/STEP/state/       the arrays
+    checkpoints/STEP/position/    the data position
+    checkpoints/STEP/sha256.json  digests of all files but orbax's marks
+    checkpoints/STEP.damaged/     put aside by a run that went on from an older one
 
 orbax keeps no checksum of the arrays: the digests find what changed on disk.
 """
@@ -12,28 +13,27 @@ import contextlib
 import os
 import shutil
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as ocp
 from jax.experimental import multihost_utils
-from orbax.checkpoint import v1 as ocp
+from orbax.checkpoint import checkpoint_managers
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import read_json, write_json
 from rcirl_jax.runtime.checked import checked
-from rcirl_jax.runtime.pipeline import digest, file_sha256
+from rcirl_jax.runtime.pipeline import file_sha256
 from rcirl_jax.train.parallel import is_first
 from rcirl_jax.train.state import TrainState
 
 KEEP_LATEST = 3  # checkpoints kept
 DIGESTS = "sha256.json"
-POSITION = "position.json"
+# of orbax, written after the digests; no restore reads them
+MARKS = ("commit_success.txt", "_CHECKPOINT_METADATA")
 DAMAGED = ".damaged"
-PROBE = ".room"
 OVERHEAD_BYTES = 2**17  # of a checkpoint's files besides the arrays
 
 
@@ -41,15 +41,15 @@ class Checkpoints:
     """Saves and restores (TrainState, data position) under one folder.
 
     Saving is asynchronous. The data position makes a resumed run see the same batches
-    in the same order; it lies beside orbax's files, because orbax never frees the
-    memory of metadata that it reads.
+    in the same order.
 
-    `passed_over` has one line for each checkpoint that is newer than the newest
-    whole one, which is the one to go on from.
+    Attributes:
+      latest_step: step of the newest whole checkpoint when this was made, or None.
+      passed_over: a line for each newer one, which is damaged.
     """
 
     def __init__(self, folder: Path, *, read_only: bool = False) -> None:
-        """Find the newest whole checkpoint; put damaged ones newer than it aside.
+        """Finds the newest whole checkpoint; puts damaged ones newer than it aside.
 
         Args:
           folder: of the checkpoints; made if missing.
@@ -60,31 +60,27 @@ class Checkpoints:
           InputError: there are checkpoints, and none is whole.
         """
         self._folder = folder.resolve()
-        if not read_only:
-            self._folder.mkdir(parents=True, exist_ok=True)
-        self._newest, bad = _newest_whole(self._folder)
+        self.latest_step, bad = _newest_whole(self._folder)
         self.passed_over = [
             f"{self._folder}: checkpoint {step}: {why}; the one before it that is "
-            f"whole: {'none' if self._newest is None else self._newest}"
+            f"whole: {self.latest_step}"
             for step, why in bad.items()
         ]
-        if not read_only:
+        if bad and not read_only:
             _put_aside(self._folder, list(bad))
-        keep: Any = ocp.training.preservation_policies.LatestN(KEEP_LATEST)
-        self._checkpointer = ocp.training.Checkpointer(
-            str(self._folder),
-            preservation_policy=keep,
+        options = ocp.CheckpointManagerOptions(
+            preservation_policy=checkpoint_managers.LatestN(KEEP_LATEST),
+            create=not read_only,
             cleanup_tmp_directories=not read_only,
+            save_root_metadata=False,
+            async_options=ocp.AsyncOptions(post_finalization_callback=self._seal),
         )
-        self._thread = ThreadPoolExecutor(1)
-        self._pending: Future[None] | None = None
-
-    def latest_step(self) -> int | None:
-        """Step of the newest whole checkpoint when this was made, or None."""
-        return self._newest
+        self._manager = ocp.CheckpointManager(
+            self._folder, options=options, item_names=("state", "position")
+        )
 
     def save(self, state: TrainState, position: dict) -> None:
-        """Start saving; returns before the files are complete.
+        """Starts saving; returns before the files are complete.
 
         Once a step. With several processes all of them call it, and the state has
         to be on the devices of all.
@@ -92,61 +88,60 @@ class Checkpoints:
         Raises:
           InputError: this one or the one before cannot be written.
         """
-        step = int(state.step)
         with self._writing():
-            self._finish_pending()
+            self._manager.wait_until_finished()
             if is_first():
-                _check_room(self._folder, state)
-            response: Any = self._checkpointer.save_async(step, state, force=True)
-            self._pending = self._thread.submit(self._seal, step, response, position)
+                self._check_room(state)
+            self._manager.save(
+                int(state.step),
+                args=ocp.args.Composite(
+                    state=ocp.args.StandardSave(state),
+                    position=ocp.args.JsonSave(position),
+                ),
+                force=True,
+            )
 
-    def _seal(self, step: int, response: Any, position: dict) -> None:  # noqa: ANN401
-        """Once the files are complete, note the position and what they are."""
-        response.result()
+    def _seal(self) -> None:
+        """Notes the digests of a checkpoint's files just before it gets its name."""
         if is_first():
-            folder = self._folder / str(step)
-            write_json(folder / POSITION, position)
-            found = _digests(folder)
-            write_json(folder / DIGESTS, {"files": found, "sha256": digest(found)})
-
-    def _finish_pending(self) -> None:
-        pending, self._pending = self._pending, None
-        if pending is not None:
-            pending.result()
+            for folder in self._folder.glob("*.orbax-checkpoint-tmp*"):
+                write_json(folder / DIGESTS, _digests(folder))
 
     def restore(self, like: TrainState) -> tuple[TrainState, dict]:
-        """The newest whole checkpoint and its data position.
+        """Returns the newest whole checkpoint and its data position.
 
         Args:
           like: a state of the same structure; only shapes are read.
 
         Raises:
-          InputError: the checkpoint was written with another structure, or its
-            position is none.
+          InputError: the checkpoint was written with another structure.
         """
-        step = self._newest
-        abstract = jax.tree.map(_abstract, like)
+        abstract = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), like
+        )
+        items = ocp.args.Composite(
+            state=ocp.args.StandardRestore(abstract), position=ocp.args.JsonRestore()
+        )
         try:
-            state = self._checkpointer.load(step, abstract)
+            found = self._manager.restore(self.latest_step, args=items)
         except (ValueError, KeyError, TypeError) as error:
             raise InputError(
-                f"{self._folder}: checkpoint {step}: {_first_line(error)}: "
+                f"{self._folder}: checkpoint {self.latest_step}: {_first_line(error)}: "
                 "expected the same features, hidden size and optimiser"
             ) from error
-        return state, read_position(self._folder / str(step) / POSITION)
+        return found["state"], found["position"]
 
     def close(self) -> None:
-        """Wait for pending saves and release the folder.
+        """Waits for pending saves and releases the folder.
 
         Raises:
           InputError: the last checkpoint could not be written.
         """
         with self._writing():
             try:
-                self._finish_pending()
+                self._manager.wait_until_finished()
             finally:
-                self._thread.shutdown()
-                self._checkpointer.close()
+                self._manager.close()
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
@@ -159,55 +154,44 @@ class Checkpoints:
                 "room for a checkpoint; the ones before are kept, run again to go on"
             ) from error
 
+    def _check_room(self, state: TrainState) -> None:
+        """Writes and removes as many bytes as a checkpoint may take.
 
-def read_position(path: Path) -> dict[str, int]:
-    """The data position beside a checkpoint's state.
-
-    Raises:
-      InputError: the file is none.
-    """
-    return checked(read_json(path, "a data position"), dict[str, int], path)
-
-
-def _check_room(folder: Path, state: TrainState) -> None:
-    """Write and remove as many bytes as a checkpoint may take.
-
-    Where it cannot write, orbax waits for minutes and fills the terminal.
-    """
-    held = sum(np.asarray(_numbers(leaf)).nbytes for leaf in jax.tree.leaves(state))
-    probe = folder / PROBE
-    try:
-        with probe.open("wb") as file:
-            file.write(bytes(2 * held + OVERHEAD_BYTES))
-            file.flush()
-            os.fsync(file.fileno())
-    finally:
-        with contextlib.suppress(OSError):
-            probe.unlink(missing_ok=True)
+        Where it cannot write, orbax waits for minutes and fills the terminal.
+        """
+        held = sum(x.nbytes for x in map(_numbers, jax.tree.leaves(state)))
+        probe = self._folder / ".room"
+        try:
+            with probe.open("wb") as file:
+                file.write(bytes(2 * held + OVERHEAD_BYTES))
+                file.flush()
+                os.fsync(file.fileno())
+        finally:
+            with contextlib.suppress(OSError):
+                probe.unlink(missing_ok=True)
 
 
-def _numbers(leaf: jax.Array) -> jax.Array:
-    """Typed keys as what they are made of."""
+def _numbers(leaf: jax.Array) -> np.ndarray:
+    """Returns a leaf on the host; typed keys as what they are made of."""
     is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-    return jax.random.key_data(leaf) if is_key else leaf
+    return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
 
 
 def _newest_whole(folder: Path) -> tuple[int | None, dict[int, str]]:
-    """The newest whole checkpoint, and what is wrong with each newer one.
+    """Returns the newest whole checkpoint, and what is wrong with each newer one.
 
     Raises:
-      InputError: there are finished ones, and none is whole.
+      InputError: there are some, and none is whole.
     """
     names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
-    steps = sorted((int(name) for name in names if name.isdecimal()), reverse=True)
     bad: dict[int, str] = {}
-    for step in steps:
+    for step in sorted((int(x) for x in names if x.isdecimal()), reverse=True):
         why = _damage(folder / str(step))
         if why is None:
             return step, bad
         bad[step] = why
-    if not any((folder / str(step) / DIGESTS).exists() for step in steps):
-        return None, bad  # killed while it wrote the first ones
+    if not bad:
+        return None, {}
     reasons = "; ".join(f"{step}: {why}" for step, why in bad.items())
     raise InputError(
         f"{folder}: checkpoint {reasons}: expected one that is whole; use another "
@@ -216,49 +200,36 @@ def _newest_whole(folder: Path) -> tuple[int | None, dict[int, str]]:
 
 
 def _damage(folder: Path) -> str | None:
-    """What is wrong with a checkpoint, if anything."""
+    """Returns what is wrong with a checkpoint, if anything."""
     try:
-        if not (folder / DIGESTS).exists():
-            return f"{DIGESTS}: missing, it was not finished"
-        noted = read_json(folder / DIGESTS, "digests")
-        files = noted["files"]
-        if not isinstance(files, dict) or noted["sha256"] != digest(files):
-            return f"{DIGESTS}: damaged"
-    except (ValueError, KeyError, TypeError):
-        return f"{DIGESTS}: damaged"
+        noted = checked(read_json(folder / DIGESTS, "digests"), dict[str, str], folder)
+    except InputError:
+        return f"{DIGESTS}: damaged or missing"
     found = _digests(folder)
-    for name in sorted(files.keys() | found.keys()):
-        if files.get(name) != found.get(name):
+    for name in sorted(noted.keys() | found.keys()):
+        if noted.get(name) != found.get(name):
             return f"{name}: {'damaged' if name in found else 'missing'}"
     return None
 
 
 def _digests(folder: Path) -> dict[str, str]:
-    """sha256 of every file of a checkpoint by its name inside the folder."""
+    """Returns the sha256 of a checkpoint's files by their names inside the folder."""
     files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
     names = {path: path.relative_to(folder).as_posix() for path in files}
-    return {name: file_sha256(path) for path, name in names.items() if name != DIGESTS}
+    ours = {path: x for path, x in names.items() if path.name not in {DIGESTS, *MARKS}}
+    return {name: file_sha256(path) for path, name in ours.items()}
 
 
 def _put_aside(folder: Path, steps: list[int]) -> None:
-    """Rename damaged checkpoints: their numbers will be written again."""
-    if not steps:
-        return
-    if jax.process_count() > 1:
-        multihost_utils.sync_global_devices("damaged checkpoints found")
-    if is_first():
-        for step in steps:
-            aside = folder / f"{step}{DAMAGED}"
-            shutil.rmtree(aside, ignore_errors=True)
-            (folder / str(step)).rename(aside)
-    if jax.process_count() > 1:
-        multihost_utils.sync_global_devices("damaged checkpoints put aside")
+    """Renames damaged checkpoints: their numbers will be written again."""
+    multihost_utils.sync_global_devices("damaged checkpoints found")
+    for step in steps if is_first() else ():
+        aside = folder / f"{step}{DAMAGED}"
+        shutil.rmtree(aside, ignore_errors=True)
+        (folder / str(step)).rename(aside)
+    multihost_utils.sync_global_devices("damaged checkpoints put aside")
 
 
 def _first_line(error: BaseException) -> str:
     text = (str(error).splitlines() or [""])[0][:200]
     return text or type(error).__name__
-
-
-def _abstract(leaf: jax.Array) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding)

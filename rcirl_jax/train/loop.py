@@ -197,7 +197,7 @@ def _train(
     checkpoints = Checkpoints(workdir / "checkpoints")
     for line in checkpoints.passed_over if is_first() else ():
         print(line, file=sys.stderr)
-    if checkpoints.latest_step() is None:
+    if checkpoints.latest_step is None:
         rows = normaliser_rows(dataset, config)
         state = parallel.replicate(init_state(config, fit_normaliser(rows, features)))
     else:
@@ -241,14 +241,12 @@ def restore_run(workdir: Path, config: TrainConfig) -> TrainState:
       InputError: there is none, it is damaged, or of another structure.
     """
     checkpoints = Checkpoints(workdir / "checkpoints", read_only=True)
-    try:
+    with contextlib.closing(checkpoints):
         for line in checkpoints.passed_over:
             raise InputError(f"{line}: expected whole; run the training again")
-        if checkpoints.latest_step() is None:
+        if checkpoints.latest_step is None:
             raise InputError(f"{workdir}: checkpoints: none: expected a trained run")
         return checkpoints.restore(blank_state(config))[0]
-    finally:
-        checkpoints.close()
 
 
 def blank_state(config: TrainConfig) -> TrainState:

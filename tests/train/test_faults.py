@@ -96,7 +96,7 @@ def test_a_folder_in_use_or_without_a_whole_checkpoint_is_left_alone(dataset, ru
         trained(dataset, run)
     assert files_of(run) == before
     for folder in (run / "checkpoints").glob("[0-9]*"):
-        (folder / "_CHECKPOINT_METADATA").unlink()
+        (folder / "position" / "metadata").unlink()
     before = files_of(run)
     with pytest.raises(InputError, match=r"expected one that is whole; use another "):
         trained(dataset, run)

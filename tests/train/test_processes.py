@@ -200,7 +200,7 @@ def test_killed_processes_resume_to_the_bit(data, undisturbed, tmp_path):
     workers[1].kill()  # it may have lost its peer just before its own signal
     assert workers[1].wait(60) != 0
     assert not list(tmp_path.glob("process_*.json"))
-    noted = tmp_path / "checkpoints" / "4" / "_CHECKPOINT_METADATA"
+    noted = tmp_path / "checkpoints" / "4" / "position" / "metadata"
     noted.write_bytes(noted.read_bytes()[:-1])
     again = start(data, tmp_path, "shard_map", 2, 2, in_memory_mb=100.0)
     # the one before is of step 3, at the end of the first epoch
@@ -210,7 +210,7 @@ def test_killed_processes_resume_to_the_bit(data, undisturbed, tmp_path):
     lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["step"] for line in lines] == list(range(1, STEPS + 1))
     said = [lines_of(tmp_path, number) for number in (0, 1)]
-    assert sum("checkpoint 4: _CHECKPOINT_METADATA" in x for x in said[0]) == 1
+    assert sum("checkpoint 4: position/metadata" in x for x in said[0]) == 1
     assert not any("checkpoint 4" in x for x in said[1])
 
 

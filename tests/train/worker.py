@@ -13,7 +13,6 @@ from rcirl_jax.data.store import batches as pipeline
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.runtime.signals import Interrupted
 from rcirl_jax.sampling import SamplerConfig
-from rcirl_jax.train.checkpoint import DIGESTS
 from rcirl_jax.train.loop import Running, train
 from rcirl_jax.train.parallel import join_processes
 from rcirl_jax.train.state import TrainConfig
@@ -31,7 +30,7 @@ CONFIG = TrainConfig(
 def main():
     job = json.loads(sys.argv[1])
     number, workdir = job["process_id"] or 0, Path(job["workdir"])
-    saved = workdir / "checkpoints" / str(job["kill_after"]) / DIGESTS
+    saved = workdir / "checkpoints" / str(job["kill_after"])
     join_processes(job["address"], job["num_processes"], job["process_id"])
     taken = []
 
