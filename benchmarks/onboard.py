@@ -59,14 +59,14 @@ def built(name: str, native: str) -> Path:
     return folder
 
 
-def network(hidden: tuple[int, ...], by_context: bool) -> RewardWeights:
+def network(hidden: tuple[int, ...], scene_gating: bool) -> RewardWeights:
     """A random reward of the size of trained ones: 21 features, 18 times."""
-    drawn = example_weights(0, 21, 18, hidden, "tanh", by_context)
+    drawn = example_weights(0, 21, 18, hidden, "tanh", scene_gating)
     return dataclasses.replace(
         drawn,
         kernels=tuple(kernel / np.sqrt(len(kernel)) for kernel in drawn.kernels),
         gamma=drawn.gamma / np.sqrt(18.0),
-        context=None if drawn.context is None else drawn.context / 21.0,
+        scene_gating=None if drawn.scene_gating is None else drawn.scene_gating / 21.0,
     )
 
 

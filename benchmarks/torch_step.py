@@ -88,7 +88,7 @@ def loss_of(
     fields = (normaliser.lower, normaliser.upper, normaliser.location, normaliser.scale)
     lower, upper, location, scale = (_tensor(x) for x in fields)
     shared = torch.tensor(config.reward.context, dtype=torch.float32)[:, None]
-    pin = _unit if config.reward.pin == "unit" else lambda x: x
+    pin = _unit if config.reward.scale_constraint == "unit" else lambda x: x
     of_values = {"rank": _rank(config.leaky_rate), "listwise": _listwise}[config.loss]
 
     def gains(context: torch.Tensor, start: torch.Tensor) -> torch.Tensor:

@@ -15,7 +15,7 @@ from rcirl_jax.cli.running import provenance, run
 from rcirl_jax.data.store.dataset import open_datasets
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.reward import LOSSES
-from rcirl_jax.reward.network import CONSTRAINTS, PINS
+from rcirl_jax.reward.network import CONSTRAINTS, SCALE_CONSTRAINTS
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.sampling.sampler import MODES
 from rcirl_jax.train.loop import Running, train
@@ -29,9 +29,11 @@ _SEED = flags.DEFINE_integer("seed", 0, "of initial weights, batches, candidates
 _FEATURES = flags.DEFINE_string("features", "paper21", "preset of data_specs/features")
 _HIDDEN = flags.DEFINE_list("hidden_size", ["15"], "units per layer; empty: linear")
 _ACTIVATION = flags.DEFINE_string("activation", "tanh", "of the hidden layers")
-_PIN = flags.DEFINE_enum("pin", "unit", PINS, "what fixes the scale of the reward")
+_SCALE = flags.DEFINE_enum(
+    "scale_constraint", "unit", SCALE_CONSTRAINTS, "what fixes the scale of the reward"
+)
 _CONSTRAINT = flags.DEFINE_enum("constraint", "none", CONSTRAINTS, "on the weights")
-_CONTEXT = flags.DEFINE_bool("by_context", False, "scale features by the scene")
+_GATING = flags.DEFINE_bool("scene_gating", False, "scale features by the scene")
 _LOSS = flags.DEFINE_enum("loss", "rank", sorted(LOSSES), "what training minimises")
 _LEAKY = flags.DEFINE_float("leaky_rate", 0.05, "a of the rank loss")
 _POSITIVE = flags.DEFINE_enum("positive", "human", POSITIVES, "what is ranked first")
@@ -50,12 +52,12 @@ def main() -> None:
     settings = {
         "hidden": tuple(int(units) for units in _HIDDEN.value if units),
         "activation": _ACTIVATION.value,
-        "pin": _PIN.value,
+        "scale_constraint": _SCALE.value,
         "constraint": _CONSTRAINT.value,
     }
     config = TrainConfig(
         features=_FEATURES.value,
-        reward=reward_config(_FEATURES.value, settings, _CONTEXT.value),
+        reward=reward_config(_FEATURES.value, settings, _GATING.value),
         sampler=SamplerConfig(mode=_MODE.value),
         loss=_LOSS.value,
         leaky_rate=_LEAKY.value,

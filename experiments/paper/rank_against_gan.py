@@ -122,7 +122,7 @@ def configs() -> dict[str, TrainConfig]:
         known = ", ".join(sorted(LOSSES))
         raise InputError(f"--losses: {losses}: expected rank and gan, all of {known}")
     shared = {"epochs": epochs(), "positive": positive()}
-    unit = dataclasses.replace(told.reward, pin="unit")
+    unit = dataclasses.replace(told.reward, scale_constraint="unit")
     rewards = {loss: unit if loss == "rank" else told.reward for loss in losses}
     return {
         loss: dataclasses.replace(told, loss=loss, reward=reward, **shared)

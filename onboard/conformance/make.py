@@ -76,10 +76,10 @@ def line(label: str, numbers: npt.ArrayLike) -> str:
 def main(folder: Path) -> None:
     """Write the three files."""
     text, rewards = [HEAD], {}
-    for preset, by_context in REWARDS.items():
+    for preset, scene_gating in REWARDS.items():
         columns = feature_map(preset)
         path = folder / f"{preset}.msgpack"
-        reward = drawn_reward(path, columns, by_context=by_context)
+        reward = drawn_reward(path, columns, scene_gating=scene_gating)
         rewards[preset] = (columns, reward)
     for number, (name, made) in enumerate(cases()):
         preset = tuple(REWARDS)[number % 2]

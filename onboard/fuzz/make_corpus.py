@@ -32,7 +32,7 @@ def main(_: list[str]) -> None:
             times=2,
             hidden=hidden,
             activation=activation,
-            by_context=gated,
+            scene_gating=gated,
             with_prior=prior,
         )
         name = f"{activation}_{len(hidden)}_{gated:d}_{prior:d}"

@@ -78,15 +78,15 @@ struct Example {
   std::size_t features = 3, times = 4, samples = 3;
   std::vector<std::size_t> hidden = {5};
   std::string activation = "tanh";
-  bool by_context = false;
+  bool scene_gating = false;
   unsigned seed = 0;
 
-  std::vector<float> lower, upper, location, scale, gamma, context;
+  std::vector<float> lower, upper, location, scale, gamma, gates;
   std::vector<std::vector<float>> kernels, biases;
 
   Example() { draw(); }
   Example(std::size_t f, std::size_t t, std::vector<std::size_t> h, std::string a, bool c)
-      : features(f), times(t), hidden(std::move(h)), activation(std::move(a)), by_context(c) {
+      : features(f), times(t), hidden(std::move(h)), activation(std::move(a)), scene_gating(c) {
     draw();
   }
 
@@ -104,7 +104,7 @@ struct Example {
     scale = normal(features, 0.1);
     for (float& value : scale) value += 1.0f;
     gamma = normal(times, 1.0 / std::sqrt(static_cast<double>(times)));
-    if (by_context) context = normal(features * features, 0.5);
+    if (scene_gating) gates = normal(features * features, 0.5);
     std::size_t in = features;
     for (std::size_t i = 0; i <= hidden.size(); ++i) {
       const std::size_t out = i < hidden.size() ? hidden[i] : 1;
@@ -143,10 +143,10 @@ struct Example {
   double value(const float* trajectory, const std::uint8_t* valid) const {
     std::vector<double> gains(features, 1.0);
     const std::vector<double> first = normalised(trajectory);
-    for (std::size_t j = 0; j < features && by_context; ++j) {
+    for (std::size_t j = 0; j < features && scene_gating; ++j) {
       double sum = 0.0;
       for (std::size_t i = 0; i < features; ++i) {
-        sum += first[i] * double{context[i * features + j]};
+        sum += first[i] * double{gates[i * features + j]};
       }
       gains[j] = 2.0 / (1.0 + std::exp(-sum));
     }
@@ -202,7 +202,7 @@ struct Example {
         {"layers", pack::list(layers)},
         {"activation", pack::text(activation)},
         {"leaky_slope", pack::real(0.01)},
-        {"scene_gating", by_context ? pack::array({size, size}, context) : pack::nil()},
+        {"scene_gating", scene_gating ? pack::array({size, size}, gates) : pack::nil()},
         {"prior_cost", pack::nil()},
         {"loss", pack::map({{"name", pack::text("rank")}, {"leaky_rate", pack::nil()}})},
         {"provenance", pack::map({{"seed", pack::natural(7)}})},

@@ -55,8 +55,8 @@ void test_fields() {
 }
 
 void test_the_total_equals_plain_loops() {
-  for (const bool by_context : {false, true}) {
-    WithPriorCost a(Example(5, 4, {6}, "tanh", by_context));
+  for (const bool scene_gating : {false, true}) {
+    WithPriorCost a(Example(5, 4, {6}, "tanh", scene_gating));
     const rcirl::Reward reward = loaded(a.file());
     CHECK(reward.has_prior_cost() && reward.incumbent() == "hand-set");
     rcirl::Workspace workspace = reward.workspace();

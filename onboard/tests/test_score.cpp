@@ -51,8 +51,8 @@ bool close(float found, double wanted) {
 std::vector<Example> examples() {
   std::vector<Example> all;
   for (const char* activation : {"tanh", "relu", "leaky_relu", "identity"}) {
-    for (const bool by_context : {false, true}) {
-      all.emplace_back(21, 18, std::vector<std::size_t>{15}, activation, by_context);
+    for (const bool scene_gating : {false, true}) {
+      all.emplace_back(21, 18, std::vector<std::size_t>{15}, activation, scene_gating);
     }
   }
   all.emplace_back(21, 18, std::vector<std::size_t>{}, "identity", false);
@@ -107,8 +107,8 @@ void test_a_candidate_without_a_value_is_refused_alone() {
 }
 
 void test_times_that_do_not_count_may_be_anything() {
-  for (const bool by_context : {false, true}) {
-    const Example example(3, 4, {5}, "tanh", by_context);
+  for (const bool scene_gating : {false, true}) {
+    const Example example(3, 4, {5}, "tanh", scene_gating);
     const rcirl::Reward reward = loaded(example);
     rcirl::Workspace workspace = reward.workspace();
     std::vector<float> features = example.inputs(2, 7);
@@ -140,8 +140,8 @@ void test_infinite_features_are_clipped() {
 }
 
 void test_masks_that_are_no_masks() {
-  for (const bool by_context : {false, true}) {
-    const Example example(3, 4, {5}, "tanh", by_context);
+  for (const bool scene_gating : {false, true}) {
+    const Example example(3, 4, {5}, "tanh", scene_gating);
     const rcirl::Reward reward = loaded(example);
     rcirl::Workspace workspace = reward.workspace();
     const std::vector<float> features = example.inputs(3, 8);
@@ -149,12 +149,12 @@ void test_masks_that_are_no_masks() {
     float values[3];
     const std::size_t refused = reward.score(
         features.data(), 3, {valid.data(), rcirl::Mask::kEach}, &workspace, values);
-    CHECK(refused == (by_context ? 2u : 1u));
-    CHECK(values[0] != kNone && (values[1] == kNone) == by_context && values[2] == kNone);
+    CHECK(refused == (scene_gating ? 2u : 1u));
+    CHECK(values[0] != kNone && (values[1] == kNone) == scene_gating && values[2] == kNone);
     const std::vector<std::uint8_t> none(4, 0);
     CHECK(reward.score(features.data(), 3, {none.data(), rcirl::Mask::kShared}, &workspace,
-                       values) == (by_context ? 3u : 0u));
-    CHECK(values[2] == (by_context ? kNone : 0.0f));
+                       values) == (scene_gating ? 3u : 0u));
+    CHECK(values[2] == (scene_gating ? kNone : 0.0f));
   }
 }
 

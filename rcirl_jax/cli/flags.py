@@ -24,7 +24,7 @@ from rcirl_jax.evaluation.baselines import SEARCHES
 from rcirl_jax.evaluation.gate.types import GateConfig
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW
 from rcirl_jax.reward import LOSSES
-from rcirl_jax.reward.network import CONSTRAINTS, PINS
+from rcirl_jax.reward.network import CONSTRAINTS, SCALE_CONSTRAINTS
 from rcirl_jax.runtime.executors import EXECUTORS, Executor, make_executor
 from rcirl_jax.sampling.sampler import MODES
 from rcirl_jax.train.state import (
@@ -183,7 +183,7 @@ _TRAINING: dict[str, tuple[type | Sequence[str], str]] = {
     ),
     "activation": (("tanh", "relu", "leaky_relu"), "of the hidden layers"),
     "constraint": (CONSTRAINTS, "nonnegative costs (linear), monotone in safety"),
-    "pin": (PINS, "scale pinning"),
+    "scale_constraint": (SCALE_CONSTRAINTS, "what fixes the scale of the reward"),
     "module": (str, "PACKAGE.MODULE:CLASS, a linen module as R_theta"),
 }
 _DEFINE = {
@@ -232,7 +232,7 @@ class Training:
         if hidden is not None:
             said["hidden"] = hidden
         said = {name: value for name, value in said.items() if value is not None}
-        return override(base, said, seed=seed, by_context=values.get("by_context"))
+        return override(base, said, seed=seed, scene_gating=values.get("scene_gating"))
 
 
 def training(*, without: Collection[str] = ()) -> Training:
@@ -266,9 +266,9 @@ def _departures(without: Collection[str]) -> dict[str, flags.FlagHolder]:
             None,
             "units per layer, 1 to 4096 each; 0: linear, easily read" + AS_SAID,
         )
-    if "by_context" not in without:
-        made["by_context"] = flags.DEFINE_bool(
-            "by_context",
+    if "scene_gating" not in without:
+        made["scene_gating"] = flags.DEFINE_bool(
+            "scene_gating",
             None,
             "scale features by what the scene is like at t = 0" + AS_SAID,
         )
@@ -528,7 +528,7 @@ def recipes_default(name: str) -> str:
     values |= {f: not getattr(collect, field) for f, (field, _) in _FILTERS.items()}
     values |= {
         "hidden_size": train.reward.hidden or 0,
-        "by_context": bool(train.reward.context),
+        "scene_gating": bool(train.reward.scene_gating),
         "mode": train.sampler.mode,
         "margins": (train.margin_distance, train.margin_collision, train.margin_rule),
         "learning_rates": train.learning_rate,

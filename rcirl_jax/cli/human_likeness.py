@@ -67,7 +67,10 @@ _TUNED = flags.DEFINE_integer(
 _LONG = flags.DEFINE_integer(
     "tuned_long", 3000, "evaluations of the hand-set cost's long search, or 0", 0
 )
-_LEARNERS_SAY = ("loss", "hidden_size", "activation", "constraint", "pin", "by_context")
+_LEARNERS_SAY = (
+    *("loss", "hidden_size", "activation"),
+    *("constraint", "scale_constraint", "scene_gating"),
+)
 _TRAINING = shared.training(without=(*_LEARNERS_SAY, "data_weights"))
 _SPLITS = shared.holdout()
 _HORIZON = shared.horizon()

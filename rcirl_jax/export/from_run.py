@@ -108,10 +108,10 @@ def reward_weights(
         times=TIMES_S,
         gamma=np.asarray(effective["gamma"]),
         kernels=tuple(np.asarray(kernel) for kernel in kernels),
-        context=np.asarray(effective["scene_gating"])
+        scene_gating=np.asarray(effective["scene_gating"])
         if "scene_gating" in effective
         else None,
-        seen=seen,
+        training_range=seen,
         prior_cost=prior_cost,
         biases=(*(np.asarray(bias) for bias in biases), np.zeros(1)),
         activation=config.reward.hidden_activation,

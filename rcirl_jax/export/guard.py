@@ -52,7 +52,7 @@ def bounds(reward: Any, limits: Limits) -> tuple[np.ndarray, np.ndarray]:  # noq
     is an open side.
     """
     margin = limits.margin * np.asarray(reward.scale, np.float64)
-    ends = np.asarray(reward.seen, np.float64)
+    ends = np.asarray(reward.training_range, np.float64)
     first, last = ends.astype(np.float32)
     lower, upper = (np.asarray(x, np.float32) for x in (reward.lower, reward.upper))
     # a value at its cap may lie anywhere beyond; what never varied has no cap

@@ -93,7 +93,7 @@ def reward_params(reward: Reward) -> tuple[RewardParams, Normaliser]:
         raise InputError(
             f"{reward.file}: leaky_slope: {reward.leaky_slope}: expected {LEAKY_SLOPE}"
         )
-    gated = {} if reward.context is None else {"scene_gating": reward.context}
+    gated = {} if reward.scene_gating is None else {"scene_gating": reward.scene_gating}
     params = {
         "gamma": reward.gamma,
         "point": point_of(list(reward.kernels), list(reward.biases[:-1])),
@@ -168,7 +168,7 @@ def row_name(reward: Reward) -> str:
         "gan": "GAN",
     }
     loss = str(reward.loss.get("name"))
-    by_scene = "" if reward.context is None else ", by context"
+    by_scene = "" if reward.scene_gating is None else ", by context"
     on = "" if reward.prior_cost is None else f", on {reward.prior_cost.incumbent}"
     words = name.get(loss, loss.replace("_", " "))
     return f"{words} {shape if hidden else 'linear'}{by_scene}{on}"

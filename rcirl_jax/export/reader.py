@@ -126,8 +126,8 @@ class Reward:
     biases: tuple[np.ndarray, ...]  # [H1], ..., [1]
     activation: str
     leaky_slope: float  # negative slope of "leaky_relu"
-    context: np.ndarray | None  # [F, F] C, the scene gating
-    seen: np.ndarray  # [2, F] ends of the training's range
+    scene_gating: np.ndarray | None  # [F, F] C, the scene gating
+    training_range: np.ndarray  # [2, F] ends of the training's range
     prior_cost: PriorCost | None  # drives on top of an incumbent, by `total`
     loss: dict[str, Any]
     provenance: dict[str, Any]
@@ -163,7 +163,7 @@ class Reward:
         """
         numbers = self._numbers(features, (len(self.times), len(self.names)))
         valid = None if time_valid is None else self._mask(time_valid, numbers.shape)
-        if self.context is not None and valid is not None:
+        if self.scene_gating is not None and valid is not None:
             self._needs_first(valid)
         return self._finite("value", self._values(numbers, valid), "finite features")
 
@@ -230,8 +230,10 @@ class Reward:
     @np.errstate(all="ignore")
     def _values(self, features: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
         x = self._normalise(features)
-        if self.context is not None:
-            x = x * (np.float32(2.0) / (1.0 + np.exp(-(x[..., :1, :] @ self.context))))
+        if self.scene_gating is not None:
+            x = x * (
+                np.float32(2.0) / (1.0 + np.exp(-(x[..., :1, :] @ self.scene_gating)))
+            )
         terms = self.gamma * self._network(x)
         if valid is not None:
             terms = np.where(valid, terms, np.float32(0.0))
@@ -339,11 +341,16 @@ def _fields(body: dict[str, Any]) -> dict[str, Any]:
     activation = _text("activation", body["activation"])
     if activation not in ACTIVATIONS:
         _fail("activation", activation, f"one of {', '.join(ACTIVATIONS)}")
-    context, prior_cost = body["scene_gating"], body["prior_cost"]
-    if context is not None:
-        context = _array("scene_gating", context, (size, size))
-    seen = _array("training_range", body["training_range"], (2, size))
-    _every("training_range", seen[:1], seen[:1] <= seen[1:], "at most the highest")
+    scene_gating, prior_cost = body["scene_gating"], body["prior_cost"]
+    if scene_gating is not None:
+        scene_gating = _array("scene_gating", scene_gating, (size, size))
+    training_range = _array("training_range", body["training_range"], (2, size))
+    _every(
+        "training_range",
+        training_range[:1],
+        training_range[:1] <= training_range[1:],
+        "at most the highest",
+    )
     loss = _map("loss", body["loss"], ("name", "leaky_rate"))
     _text("loss.name", loss["name"])
     if loss["leaky_rate"] is not None:
@@ -357,8 +364,8 @@ def _fields(body: dict[str, Any]) -> dict[str, Any]:
         **_layers(body["layers"], size),
         "activation": activation,
         "leaky_slope": _number("leaky_slope", body["leaky_slope"]),
-        "context": context,
-        "seen": seen,
+        "scene_gating": scene_gating,
+        "training_range": training_range,
         "prior_cost": None if prior_cost is None else _prior_cost(prior_cost, size),
         "loss": loss,
         "provenance": _plain("provenance", body["provenance"], MAX_DEPTH),
@@ -442,7 +449,7 @@ def _verify(reward: Reward, samples: object) -> None:
     features = _array("samples.features", found["features"], shape)
     valid = _array("samples.valid", found["valid"], shape[:2])
     _every("samples.valid", valid, (valid == 0.0) | (valid == 1.0), "0 or 1")
-    if reward.context is not None or reward.prior_cost is not None:
+    if reward.scene_gating is not None or reward.prior_cost is not None:
         first = valid[:, :1]
         _every("samples.valid", first, first == 1.0, "1 at the first time")
     # One sample at a time: little memory, however wide the layers are.

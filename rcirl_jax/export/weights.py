@@ -46,7 +46,7 @@ class FeatureSpec:
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class RewardWeights:
-    """A reward in its effective weights: any scale pinning is already applied.
+    """A reward in its effective weights: constraints are applied already.
 
     x = (clip(f, lower, upper) - location) / scale, scaled by the scene's gains if
     there is scene gating, then the layers, the last one linear with one output;
@@ -64,8 +64,8 @@ class RewardWeights:
     gamma: np.ndarray  # [T]
     kernels: tuple[np.ndarray, ...]  # [F, H1], ..., [H, 1]
     biases: tuple[np.ndarray, ...]  # [H1], ..., [1]; one for every kernel
-    context: np.ndarray | None = None  # [F, F] scene gating; None: one reward
-    seen: np.ndarray  # [2, F], ends of the training's range
+    scene_gating: np.ndarray | None = None  # [F, F] scene gating; None: one reward
+    training_range: np.ndarray  # [2, F], ends of the training's range
     # of a reward driven on top of an incumbent
     prior_cost: reader.PriorCost | None = None
     activation: str  # of the hidden layers: tanh, relu, leaky_relu, identity
@@ -206,7 +206,7 @@ def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, 
             key: _array(f"normaliser.{key}", getattr(weights, key))
             for key in reader.RANGES
         },
-        "training_range": _array("training_range", weights.seen),
+        "training_range": _array("training_range", weights.training_range),
         "times": _array("times", weights.times),
         "gamma": _array("gamma", weights.gamma),
         "layers": [
@@ -218,7 +218,7 @@ def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, 
         ],
         "activation": weights.activation,
         "leaky_slope": _plain(weights.leaky_slope),
-        "scene_gating": maybe("scene_gating", weights.context),
+        "scene_gating": maybe("scene_gating", weights.scene_gating),
         "prior_cost": prior,
         "loss": _plain(weights.loss),
         "provenance": _plain(weights.provenance),

@@ -44,7 +44,7 @@ ACTIVATIONS = {
     "leaky_relu": lambda x: jax.nn.leaky_relu(x, LEAKY_SLOPE),
     "identity": lambda x: x,
 }
-PINS = ("unit", "none")
+SCALE_CONSTRAINTS = ("unit", "none")
 CONSTRAINTS = ("none", "nonnegative", "monotone")
 GLOROT = jax.nn.initializers.glorot_uniform()
 
@@ -58,14 +58,14 @@ class RewardConfig:
     # key of ACTIVATIONS
     activation: str = "tanh"
     # "unit": output kernel and gamma have unit norm (see `effective_params`); "none"
-    pin: str = "unit"
+    scale_constraint: str = "unit"
     # "nonnegative": weights of costs, `hidden` must be (); "monotone": `signs`
     constraint: str = "none"
     # per feature: 1 the reward may not fall with it, -1 may not rise, 0 free
     signs: tuple[int, ...] = ()
     # per feature: 1 if its value at t = 0 is part of the scene that sets the gates of
     # all features (see `feature_gates`); () for one reward in all scenes
-    context: tuple[int, ...] = ()
+    scene_gating: tuple[int, ...] = ()
     # "package.module:Class", a linen module [..., F] -> [...] that is R_theta in the
     # place of `hidden` and `activation` (see `user_module`); "": the package's own
     module: str = ""
@@ -76,8 +76,11 @@ class RewardConfig:
             raise InputError(
                 f"activation: {self.activation}: expected one of {sorted(ACTIVATIONS)}"
             )
-        if self.pin not in PINS:
-            raise InputError(f"pin: {self.pin}: expected one of {PINS}")
+        if self.scale_constraint not in SCALE_CONSTRAINTS:
+            raise InputError(
+                f"scale_constraint: {self.scale_constraint}: expected one of "
+                f"{SCALE_CONSTRAINTS}"
+            )
         if self.constraint not in CONSTRAINTS:
             raise InputError(
                 f"constraint: {self.constraint}: expected one of {CONSTRAINTS}"
@@ -144,7 +147,7 @@ class RewardModel(nn.Module):
             "gamma": self.param("gamma", equal, (self.times,)),
             "point": self.param("point", functools.partial(_first, config), count),
         }
-        if config.context:
+        if config.scene_gating:
             raw["scene_gating"] = self.param("scene_gating", zeros, (count, count))
         params = effective_params(raw, config)
         # Sets follow one another along the points: a human between the candidates of
@@ -153,7 +156,9 @@ class RewardModel(nn.Module):
         x = normalise_rows(normaliser, x)
         # all trajectories of a scene share what its gates read at t = 0
         gates = (
-            feature_gates(params["scene_gating"], x[:, 0]) if config.context else None
+            feature_gates(params["scene_gating"], x[:, 0])
+            if config.scene_gating
+            else None
         )
         if config.module:
             x = x if gates is None else x * gates[:, None]
@@ -258,17 +263,17 @@ def effective_params(raw: RewardParams, config: RewardConfig) -> dict[str, Any]:
       InputError: a fixed scale, and a module without a layer `out`.
     """
     params = _constrained(dict(raw), config)
-    if config.context:
+    if config.scene_gating:
         # C without its rows of features that candidates do not share at t = 0
-        shared = jnp.asarray(config.context, jnp.float32)[:, None]
+        shared = jnp.asarray(config.scene_gating, jnp.float32)[:, None]
         params["scene_gating"] = shared * params["scene_gating"]
-    if config.pin == "none" or config.constraint == "nonnegative":
+    if config.scale_constraint == "none" or config.constraint == "nonnegative":
         return params
     point = dict(params["point"])
     if config.module and "kernel" not in point.get("out", {}):
         raise InputError(
-            f"pin: {config.pin}: expected none with module={config.module}, which "
-            "has no last layer `out`"
+            f"scale_constraint: {config.scale_constraint}: expected none with "
+            f"module={config.module}, which has no last layer `out`"
         )
     if not config.module and config.activation != "tanh":
         for name in point.keys() - {"out"}:
@@ -298,7 +303,7 @@ def _constrained(params: dict[str, Any], config: RewardConfig) -> dict[str, Any]
     kernels, biases = layers_of(params["point"])
     if config.constraint == "nonnegative":
         costs = jnp.abs(kernels[0])
-        if config.pin == "unit":
+        if config.scale_constraint == "unit":
             gamma, costs = _unit(gamma), _unit(costs)
         eye = jnp.eye(costs.shape[0] // 2)
         kernels = [jnp.concatenate([eye, -eye], axis=1), -costs]
@@ -337,9 +342,9 @@ def init_params(
         none, is not a pure function [..., F] -> [...] of parameters alone, or whose
         scale cannot be fixed.
     """
-    if config.context and len(config.context) != num_features:
+    if config.scene_gating and len(config.scene_gating) != num_features:
         raise InputError(
-            f"context: {len(config.context)} columns: expected {num_features}"
+            f"scene_gating: {len(config.scene_gating)} columns: expected {num_features}"
         )
     if config.module:
         _check_module(config.module, num_features)
@@ -355,8 +360,8 @@ def effective_model(params: RewardParams, activation: str) -> RewardModel:
     config = RewardConfig(
         hidden=tuple(kernel.shape[1] for kernel in kernels[:-1]),
         activation=activation,
-        pin="none",
-        context=(1,) * kernels[0].shape[0] if "scene_gating" in params else (),
+        scale_constraint="none",
+        scene_gating=(1,) * kernels[0].shape[0] if "scene_gating" in params else (),
     )
     return RewardModel(config, times=params["gamma"].shape[0])
 
@@ -395,7 +400,7 @@ def value(
 
     def one(x: jax.Array, valid: jax.Array) -> jax.Array:
         # whatever stands at times that do not count; gates read the first
-        kept = valid.at[0].set(True) if model.config.context else valid
+        kept = valid.at[0].set(True) if model.config.scene_gating else valid
         rows = jnp.where(kept, x.T, 0.0)[:, :, None]
         return scene_values(model, params, normaliser, valid, rows)[0][0]
 

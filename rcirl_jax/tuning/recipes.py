@@ -4,7 +4,7 @@
     data_specs/recipes/paper.toml   the paper's own setting
     data_specs/recipes/quick.toml   for the demo
 
-[train] are fields of `TrainConfig`, [train.reward] of `RewardConfig` (`by_context`
+[train] are fields of `TrainConfig`, [train.reward] of `RewardConfig` (`scene_gating`
 stands for the preset's context columns), [train.sampler] of `SamplerConfig`, [collect]
 of `CollectConfig`, [simulated_demonstrations] of `SimulatedDemonstrations`,
 [prior_cost] of `PriorCostConfig`. What a file leaves out is the field's own default.
@@ -36,7 +36,7 @@ SIMULATED = "simulated_demonstrations"
 TABLES = ("about", "train", "collect", SIMULATED, "prior_cost", "autotune")
 # of a run, not of a recipe
 NOT_OF_A_RECIPE = ("seed", "reward", "sampler")
-PRESETS_OWN = ("context", "signs")  # of a reward, what its feature preset says
+PRESETS_OWN = ("scene_gating", "signs")  # of a reward, what its feature preset says
 EXPERTS = ("none", "driver model", "hand-set", "incumbent")
 SUITE_SEED = 0  # of the catalogue that rewards are judged on
 
@@ -158,17 +158,18 @@ def load_recipe(name: str) -> Recipe:
     check_names(f"{path}: ", body, TABLES)
     train = _table(path, "train", body)
     network = _table(path, "train.reward", train)
-    by_context = network.pop("by_context", False)
-    if not isinstance(by_context, bool):
+    scene_gating = network.pop("scene_gating", False)
+    if not isinstance(scene_gating, bool):
         raise InputError(
-            f"{path}: [train.reward] by_context: {by_context}: expected true or false"
+            f"{path}: [train.reward] scene_gating: {scene_gating}: expected true or "
+            "false"
         )
     sampler = _table(path, "train.sampler", train)
     settings = typed_fields(TrainConfig, train, f"{path}: [train] ", NOT_OF_A_RECIPE)
     features = settings.get("features", "paper21")
     with _inside(path, "train.reward") as where:
         of_reward = typed_fields(RewardConfig, network, where, PRESETS_OWN)
-        reward = reward_config(features, of_reward, by_context)
+        reward = reward_config(features, of_reward, scene_gating)
     with _inside(path, "train.sampler") as where:
         sampler = SamplerConfig(**typed_fields(SamplerConfig, sampler, where))
     with _inside(path, "train"):
@@ -226,14 +227,14 @@ def _table(path: Path, where: str, body: dict) -> dict:
 
 
 def reward_config(
-    features: str, settings: Mapping[str, Any], by_context: bool
+    features: str, settings: Mapping[str, Any], scene_gating: bool
 ) -> RewardConfig:
     """The network with the preset's context and signs where they are asked for."""
     preset = feature_map(features)
     monotone = settings.get("constraint") == "monotone"
     return RewardConfig(
         **settings,
-        context=preset.context if by_context else (),
+        scene_gating=preset.context if scene_gating else (),
         signs=preset.signs if monotone else (),
     )
 
@@ -243,7 +244,7 @@ def override(
     given: Mapping[str, Any],
     *,
     seed: int = 0,
-    by_context: bool | None = None,
+    scene_gating: bool | None = None,
 ) -> TrainConfig:
     """Overrides settings of a recipe's training.
 
@@ -251,7 +252,7 @@ def override(
       base: the recipe's.
       given: fields of `TrainConfig`, and of its `RewardConfig` beside them.
       seed: of initial weights, batches, candidates.
-      by_context: whether the scene sets the gains; None: as in the recipe.
+      scene_gating: whether the scene sets the gains; None: as in the recipe.
 
     Raises:
       InputError: a value that cannot be.
@@ -264,7 +265,7 @@ def override(
     reward = reward_config(
         rest.get("features", base.features),
         settings,
-        bool(base.reward.context) if by_context is None else by_context,
+        bool(base.reward.scene_gating) if scene_gating is None else scene_gating,
     )
     return dataclasses.replace(base, **rest, seed=seed, reward=reward)
 

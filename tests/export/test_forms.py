@@ -23,10 +23,14 @@ from tests.helpers.weights_files import example_weights, loop_value, random_weig
 F, T = 5, 7
 
 
-def reward(folder, hidden=(15,), activation="tanh", by_context=False, kernels=None):
+def reward(folder, hidden=(15,), activation="tanh", scene_gating=False, kernels=None):
     """A verified file of random weights, without an output bias."""
     made = example_weights(
-        features=F, times=T, hidden=hidden, activation=activation, by_context=by_context
+        features=F,
+        times=T,
+        hidden=hidden,
+        activation=activation,
+        scene_gating=scene_gating,
     )
     biases = (*made.biases[:-1], np.zeros(1, np.float32))
     made = dataclasses.replace(made, biases=biases)
@@ -58,11 +62,11 @@ SHAPES = [
 ]
 
 
-@pytest.mark.parametrize(("hidden", "activation", "by_context"), SHAPES)
+@pytest.mark.parametrize(("hidden", "activation", "scene_gating"), SHAPES)
 def test_onnx_and_jax_export_score_as_the_file(
-    tmp_path, hidden, activation, by_context
+    tmp_path, hidden, activation, scene_gating
 ):
-    made, (x, valid) = reward(tmp_path, hidden, activation, by_context), inputs()
+    made, (x, valid) = reward(tmp_path, hidden, activation, scene_gating), inputs()
     want = made.value(x, np.broadcast_to(valid, x.shape[:2]))
     write_onnx(tmp_path / "w.onnx", made)
     model = onnx.load(tmp_path / "w.onnx")

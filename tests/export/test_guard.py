@@ -25,7 +25,7 @@ def made(**changes):
         upper=np.full(F, 2.0),
         location=np.zeros(F),
         scale=np.full(F, 0.4),
-        seen=np.array([[-1.0] * F, [1.0] * F]),
+        training_range=np.array([[-1.0] * F, [1.0] * F]),
         **changes,
     )
     return decode_weights(pack(weights, *example_samples(weights)))
@@ -73,7 +73,7 @@ def reaching(low, high):
         upper=np.full(F, 1.0),
         location=np.zeros(F),
         scale=np.ones(F),
-        seen=np.array([low, high]),
+        training_range=np.array([low, high]),
     )
     return decode_weights(pack(weights, *example_samples(weights)))
 
@@ -148,7 +148,10 @@ def test_a_file_as_training_exports_it_notices_what_it_never_saw(tmp_path):
     reward = export_run(tmp_path / "run", dataset, tmp_path / "w.msgpack")
     judge, usual = Guard(reward), reward.location[None, None]
     assert judge.check(usual).in_distribution
-    below, above = reward.seen[0] <= reward.lower, reward.seen[1] >= reward.upper
+    below, above = (
+        reward.training_range[0] <= reward.lower,
+        reward.training_range[1] >= reward.upper,
+    )
     assert 0 < below.sum() < below.size
     assert 0 < above.sum() < above.size
     for i, name in enumerate(reward.names):

@@ -382,7 +382,7 @@ def test_the_pure_python_msgpack_refuses_the_same(monkeypatch):
 
 
 def test_scene_gating_needs_the_first_time():
-    weights = example_weights(by_context=True)
+    weights = example_weights(scene_gating=True)
     features, valid, values = example_samples(weights)
     reward = decode_weights(pack(weights, features, valid, values))
     late = np.array(valid)

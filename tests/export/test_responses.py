@@ -17,7 +17,7 @@ def linear(tmp_path, **ends):
     weight = draw(size=(len(reward.names), 1)).astype(np.float32)
     made = dataclasses.replace(
         reward, kernels=(weight,), biases=(np.zeros(1, np.float32),),
-        activation="identity", context=None, **ends,
+        activation="identity", scene_gating=None, **ends,
     )  # fmt: skip
     return made, weight
 

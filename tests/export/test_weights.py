@@ -60,12 +60,12 @@ def test_file_scores_as_the_float64_loops(
     assert np.all(np.abs(found - values) <= 1e-5 * np.maximum(1.0, np.abs(values)))
 
 
-@pytest.mark.parametrize("by_context", [False, True])
+@pytest.mark.parametrize("scene_gating", [False, True])
 @pytest.mark.parametrize("hidden", [(), (15,), (16, 8)])
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_thousand_inputs_equal_the_trained_network(activation, hidden, by_context):
+def test_thousand_inputs_equal_the_trained_network(activation, hidden, scene_gating):
     """The file carries the EFFECTIVE weights: the trainer pins raw ones itself."""
-    made = trained_network(hidden, activation, by_context, 1000)
+    made = trained_network(hidden, activation, scene_gating, 1000)
     weights, features, valid, expected = made
     data = pack(weights, features[:16], valid[:16], expected[:16])
     found = decode_weights(data).value(features, valid)
@@ -87,7 +87,9 @@ def test_everything_comes_back_as_it_was_given():
     weights = example_weights(hidden=(4, 2), activation="leaky_relu", with_prior=True)
     reward = decode_weights(pack(weights, *example_samples(weights)))
     numbers = ("lower", "upper", "location", "scale", "times", "gamma")
-    np.testing.assert_array_equal(reward.seen, np.float32(weights.seen))
+    np.testing.assert_array_equal(
+        reward.training_range, np.float32(weights.training_range)
+    )
     assert_back(reward, weights, (*numbers, "kernels", "biases"))
     assert reward.names == tuple(spec.name for spec in weights.features)
     assert reward.units == tuple(spec.unit for spec in weights.features)
@@ -136,7 +138,7 @@ def test_layout_is_the_documented_one():
     body = msgpack.unpackb(outer["body"])
     assert tuple(body) == reader.BODY_KEYS
     assert body["scene_gating"] is body["prior_cost"] is body["samples"]["gain"] is None
-    full = body_of(packed(with_prior=True, by_context=True))
+    full = body_of(packed(with_prior=True, scene_gating=True))
     assert full["scene_gating"]["shape"] == [3, 3]
     assert tuple(full["prior_cost"]) == reader.PRIOR_COST_KEYS
     assert tuple(full["prior_cost"]["familiarity"]) == reader.FAMILIARITY_KEYS
@@ -147,11 +149,11 @@ def test_layout_is_the_documented_one():
     np.testing.assert_array_equal(found, weights.kernels[0])
 
 
-@pytest.mark.parametrize("by_context", [False, True])
-def test_a_reader_written_from_the_page_scores_the_samples(by_context):
+@pytest.mark.parametrize("scene_gating", [False, True])
+def test_a_reader_written_from_the_page_scores_the_samples(scene_gating):
     """docs/weights_format.md and nothing else: msgpack, struct, loops."""
     outer = msgpack.unpackb(
-        packed(hidden=(4, 2), activation="leaky_relu", by_context=by_context)
+        packed(hidden=(4, 2), activation="leaky_relu", scene_gating=scene_gating)
     )
     body = msgpack.unpackb(outer["body"])
 
@@ -168,7 +170,7 @@ def test_a_reader_written_from_the_page_scores_the_samples(by_context):
         biases=[numbers(layer["bias"]) for layer in body["layers"]],
         activation=body["activation"],
         leaky_slope=body["leaky_slope"],
-        context=numbers(body["scene_gating"]) if by_context else None,
+        scene_gating=numbers(body["scene_gating"]) if scene_gating else None,
     )
     features, valid, values = (
         numbers(body["samples"][key]) for key in reader.SAMPLE_KEYS[:3]
@@ -182,7 +184,7 @@ def test_schema_describes_the_body_and_refuses_others():
     schema = json.loads(path.read_text(encoding="utf-8"))
     jsonschema.Draft202012Validator.check_schema(schema)
     validator = jsonschema.Draft202012Validator(schema)
-    kinds = ({"hidden": (4, 2)}, {"by_context": True, "with_prior": True})
+    kinds = ({"hidden": (4, 2)}, {"scene_gating": True, "with_prior": True})
     plain, full = (to_json(packed(**kind)) for kind in kinds)
     for made in (plain, full, to_json(GOLDEN.read_bytes())):
         validator.validate(made)
@@ -234,7 +236,7 @@ def test_a_file_that_planners_have_scores_as_it_did():
     )
     reward = load_weights(path)
     assert reward.names == ("feature0", "feature1", "feature2", "feature3")
-    assert reward.context is not None
+    assert reward.scene_gating is not None
     close = {"rtol": 1e-6, "atol": 1e-6}
     assert np.ptp(value) > 1.0
     np.testing.assert_allclose(reward.value(features, valid), value, **close)

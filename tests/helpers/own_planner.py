@@ -27,11 +27,11 @@ def every_column():
     return FeatureMap("every", tuple(specs.values()))
 
 
-def drawn_reward(path, columns, hidden=(15,), by_context=False, seed=3):
+def drawn_reward(path, columns, hidden=(15,), scene_gating=False, seed=3):
     """A weights file of these columns at the usual times, of weights as trained."""
     specs, rng = columns.specs, np.random.default_rng(seed)
     size = len(specs)
-    drawn = example_weights(seed, size, TIMES_S.size, hidden, "tanh", by_context)
+    drawn = example_weights(seed, size, TIMES_S.size, hidden, "tanh", scene_gating)
     lower, upper = (
         np.array([getattr(s, n) for s in specs]) for n in ("lower", "upper")
     )
@@ -43,14 +43,14 @@ def drawn_reward(path, columns, hidden=(15,), by_context=False, seed=3):
         ),
         lower=lower,
         upper=upper,
-        seen=np.stack([lower, upper]),
+        training_range=np.stack([lower, upper]),
         location=np.array([spec.none for spec in specs]),
         scale=0.3 * (upper - lower),
         times=TIMES_S,
         kernels=tuple(kernel / np.sqrt(len(kernel)) for kernel in drawn.kernels),
         biases=(*drawn.biases[:-1], np.zeros(1)),  # as training leaves it
         gamma=drawn.gamma / np.sqrt(TIMES_S.size),
-        context=None if drawn.context is None else drawn.context / size,
+        scene_gating=None if drawn.scene_gating is None else drawn.scene_gating / size,
     )
     x = rng.uniform(lower, upper, (3, TIMES_S.size, size)).astype(np.float32)
     valid = np.ones(x.shape[:2], bool)

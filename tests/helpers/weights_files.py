@@ -37,7 +37,7 @@ def provenance():
 
 
 def example_weights(
-    seed=0, features=3, times=4, hidden=(5,), activation="tanh", by_context=False,
+    seed=0, features=3, times=4, hidden=(5,), activation="tanh", scene_gating=False,
     with_prior=False,
 ):  # fmt: skip
     rng = np.random.default_rng(seed)
@@ -55,8 +55,10 @@ def example_weights(
         scale=0.5 + rng.random(features, np.float32),
         times=np.linspace(0.0, 8.0, times, dtype=np.float32),
         gamma=draw(times),
-        context=draw(features, features) if by_context else None,
-        seen=np.sort(np.random.default_rng(seed).normal(size=(2, features)), axis=0),
+        scene_gating=draw(features, features) if scene_gating else None,
+        training_range=np.sort(
+            np.random.default_rng(seed).normal(size=(2, features)), axis=0
+        ),
         prior_cost=example_prior_cost(seed, features) if with_prior else None,
         kernels=tuple(draw(*pair) for pair in pairwise(sizes)),
         biases=tuple(draw(size) for size in sizes[1:]),
@@ -86,7 +88,7 @@ def example_samples(weights, count=4, seed=1):
     size = (count, len(weights.times), len(weights.features))
     features = rng.normal(scale=2.0, size=size).astype(np.float32)
     valid = rng.random(size[:2]) < 0.7
-    valid[:, 0] |= weights.context is not None or weights.prior_cost is not None
+    valid[:, 0] |= weights.scene_gating is not None or weights.prior_cost is not None
     values = [loop_value(weights, *one) for one in zip(features, valid, strict=True)]
     return features, valid, np.array(values)
 
@@ -108,11 +110,11 @@ def loop_value(weights, features, valid):
         np.asarray(getattr(weights, name), np.float64) for name in reader.RANGES
     )
     rows = (np.clip(np.asarray(features, np.float64), lower, upper) - location) / scale
-    if weights.context is not None:
+    if weights.scene_gating is not None:
         rows = (
             rows
             * 2.0
-            / (1.0 + np.exp(-rows[0] @ np.asarray(weights.context, np.float64)))
+            / (1.0 + np.exp(-rows[0] @ np.asarray(weights.scene_gating, np.float64)))
         )
     total, last = 0.0, len(weights.kernels) - 1
     for t in np.flatnonzero(valid):
@@ -154,7 +156,7 @@ def of_the_preset(made, **changes):
     )
     own = {"preset": "paper21", "times": TIMES_S, "leaky_slope": LEAKY_SLOPE}
     own |= {"lower": LOWER, "upper": UPPER, "features": features}
-    own["seen"] = np.stack([LOWER, UPPER])
+    own["training_range"] = np.stack([LOWER, UPPER])
     return dataclasses.replace(made, **{**own, **changes})
 
 
@@ -176,7 +178,7 @@ def random_weights(path, draw=2, **provenance):
     return path
 
 
-def trained_network(hidden, activation, by_context, count):
+def trained_network(hidden, activation, scene_gating, count):
     """Effective weights of a random network, inputs, masks and the trainer's values."""
     rng, size = np.random.default_rng(3), len(SPECS)
     normaliser = Normaliser(
@@ -185,11 +187,11 @@ def trained_network(hidden, activation, by_context, count):
         location=jnp.asarray(rng.uniform(LOWER, UPPER), jnp.float32),
         scale=jnp.asarray(0.2 * (UPPER - LOWER)),
     )
-    context = feature_map("paper21").context if by_context else ()
-    config = RewardConfig(hidden=hidden, activation=activation, context=context)
+    context = feature_map("paper21").context if scene_gating else ()
+    config = RewardConfig(hidden=hidden, activation=activation, scene_gating=context)
     raw = init_params(jax.random.key(5), size, config)
     raw["gamma"] = jnp.asarray(rng.normal(size=18), jnp.float32)
-    if by_context:
+    if scene_gating:
         drawn = rng.normal(scale=0.2, size=(size, size))
         raw["scene_gating"] = jnp.asarray(drawn, jnp.float32)
     effective = effective_params(raw, config)
@@ -204,7 +206,7 @@ def trained_network(hidden, activation, by_context, count):
         example_weights(),
         **{name: getattr(normaliser, name) for name in reader.RANGES},
         gamma=effective["gamma"],
-        context=effective.get("scene_gating"),
+        scene_gating=effective.get("scene_gating"),
         kernels=tuple(kernels),
         biases=(*biases, np.zeros(1)),
         activation=activation,

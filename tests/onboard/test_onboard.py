@@ -26,8 +26,10 @@ from tests.helpers.weights_files import (
 from tests.onboard.programs import ONBOARD, built, configured, run
 
 VALID = packed(features=2, times=3, hidden=(4,))
-GATED = packed(features=2, times=3, hidden=(4,), by_context=True)
-WITH_PRIOR = packed(features=2, times=3, hidden=(4,), by_context=True, with_prior=True)
+GATED = packed(features=2, times=3, hidden=(4,), scene_gating=True)
+WITH_PRIOR = packed(
+    features=2, times=3, hidden=(4,), scene_gating=True, with_prior=True
+)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +70,7 @@ def assert_close(found, expected):
 
 
 @pytest.mark.parametrize(
-    ("hidden", "activation", "by_context"),
+    ("hidden", "activation", "scene_gating"),
     [
         ((), "identity", False),
         ((), "identity", True),
@@ -82,10 +84,10 @@ def assert_close(found, expected):
     ],
 )
 def test_ten_thousand_scores_equal_python_and_jax(
-    programs, tmp_path, hidden, activation, by_context
+    programs, tmp_path, hidden, activation, scene_gating
 ):
     path = tmp_path / "weights.msgpack"
-    made = trained_network(hidden, activation, by_context, 10_000)
+    made = trained_network(hidden, activation, scene_gating, 10_000)
     weights, features, valid, jax_values = made
     reward = save(path, weights, features[:16], valid[:16], jax_values[:16])
     found = scores(programs, "score", path, features)

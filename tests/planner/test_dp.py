@@ -23,9 +23,9 @@ MIDDLE = DpConfig(step=2.0, max_speed=26.0, max_way=160.0)
 
 
 @functools.cache
-def weights(seed=0, by_context=False):
+def weights(seed=0, scene_gating=False):
     params = init_params(jax.random.key(seed), 21, SHAPE)
-    if by_context:
+    if scene_gating:
         drawn = np.random.default_rng(seed).normal(0.0, 0.3, (21, 21))
         drawn *= np.asarray(FEATURES.context)[:, None]
         params["scene_gating"] = jnp.asarray(drawn, jnp.float32)
@@ -73,11 +73,11 @@ def scene_of(seed):
     )
 
 
-@pytest.mark.parametrize("by_context", [False, True])
-def test_value_of_the_plan_is_the_networks_own(by_context):
+@pytest.mark.parametrize("scene_gating", [False, True])
+def test_value_of_the_plan_is_the_networks_own(scene_gating):
     feasible = 0
     for seed in range(12):
-        made, own = scene_of(seed), weights(seed, by_context)
+        made, own = scene_of(seed), weights(seed, scene_gating)
         plan = planner(MIDDLE)(made, own)
         feasible += bool(plan.feasible)
         again = float(network_value(made, plan.trajectory, own))

@@ -60,7 +60,7 @@ def test_scores_are_the_reward_of_training():
     candidates = sampled(jax.random.key(0), made, ONLINE)
     params, norm = weights()
     mask = jnp.broadcast_to(made.time_valid, (64, 18))
-    model = RewardModel(RewardConfig(pin="none"))
+    model = RewardModel(RewardConfig(scale_constraint="none"))
     expected = value(
         model, params, norm, FEATURES.of_candidates(made, candidates), mask
     )

@@ -28,10 +28,12 @@ NETWORKS = {
     "linear": RewardConfig(hidden=()),
     "paper": RewardConfig(hidden=(3,)),
     "relu": RewardConfig(hidden=(3,), activation="relu"),
-    "deep": RewardConfig(hidden=(3, 2), activation="leaky_relu", pin="none"),
+    "deep": RewardConfig(
+        hidden=(3, 2), activation="leaky_relu", scale_constraint="none"
+    ),
     "nonnegative": RewardConfig(hidden=(), constraint="nonnegative"),
     "monotone": RewardConfig(hidden=(3,), constraint="monotone", signs=(1, -1, 0, 0)),
-    "by context": RewardConfig(hidden=(3,), context=(1, 0, 1, 1)),
+    "by context": RewardConfig(hidden=(3,), scene_gating=(1, 0, 1, 1)),
 }
 
 
@@ -43,8 +45,8 @@ def effective(p, config):
     """Float64 parameters with signs and scale as the configuration asks for."""
     gamma, (kernels, biases) = p["gamma"], layers_of(p["point"])
     context = None
-    if config.context:
-        context = p["scene_gating"] * np.array(config.context)[:, None]
+    if config.scene_gating:
+        context = p["scene_gating"] * np.array(config.scene_gating)[:, None]
     if config.constraint == "nonnegative":
         costs, gamma = unit(np.abs(kernels[0])), unit(np.abs(gamma))
         eye = np.eye(F)
@@ -54,7 +56,7 @@ def effective(p, config):
         kernels[0] = np.where(signs == 0, kernels[0], signs * np.abs(kernels[0]))
         kernels[1:] = [np.abs(kernel) for kernel in kernels[1:]]
         gamma = np.abs(gamma)
-    if config.pin == "unit":
+    if config.scale_constraint == "unit":
         if config.activation != "tanh":
             for i, bias in enumerate(biases):
                 norm = np.sqrt(np.sum(kernels[i] ** 2, axis=0) + bias**2 + 1e-12)
@@ -102,7 +104,7 @@ def drawn(name, config, seed):
     counts = rng.random((B, K)) < 0.7
     counts[:, 0], counts[1] = True, False  # one scene has nothing to compare
     human, candidates = rng.normal(0, 2, (B, T, F)), rng.normal(0, 2, (B, F, T, K))
-    for feature in np.nonzero(config.context)[0]:  # shared at t = 0 in every scene
+    for feature in np.nonzero(config.scene_gating)[0]:  # shared at t = 0 in every scene
         candidates[:, feature, 0] = human[:, :1, feature]
     made = FeatureBatch(
         human=as32(human), candidates=as32(candidates), feasible=jnp.asarray(counts),

@@ -26,12 +26,12 @@ from tests.reward.compared import compared
 
 FEATURES = feature_map("paper21")
 F, T, K = 21, TIMES_S.size, 5
-GATED = RewardConfig(context=FEATURES.context)
+GATED = RewardConfig(scene_gating=FEATURES.context)
 CONFIGS = {
     "linear": {"hidden": ()},
     "paper": {},
     "deep, leaky": {"hidden": (8, 4), "activation": "leaky_relu"},
-    "relu, free": {"activation": "relu", "pin": "none"},
+    "relu, free": {"activation": "relu", "scale_constraint": "none"},
     "nonnegative": {"hidden": (), "constraint": "nonnegative"},
     "monotone": {"constraint": "monotone", "signs": FEATURES.signs},
 }
@@ -73,8 +73,8 @@ def values(params, x, config, valid=None):
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_scene_in_one_pass_is_each_trajectory_by_itself(name, gated):
     """Values and gradients of the Siamese pair, raw or by the effective module."""
-    context = FEATURES.context if gated else ()
-    config = RewardConfig(**CONFIGS[name], context=context)
+    columns = FEATURES.context if gated else ()
+    config = RewardConfig(**CONFIGS[name], scene_gating=columns)
     x, valid = trajectories(), jnp.arange(T) < 11
 
     own = RewardModel(config)
@@ -101,7 +101,7 @@ def test_a_scene_in_one_pass_is_each_trajectory_by_itself(name, gated):
 
 def test_parameters_of_another_shape_are_refused():
     """Filling up hidden units hides no row that is missing."""
-    config = RewardConfig(hidden=(5,), pin="none")
+    config = RewardConfig(hidden=(5,), scale_constraint="none")
     for layer in ("hidden_0", "out"):
         params = drawn(config)
         short = params["point"][layer]["kernel"][:-1]
@@ -112,8 +112,8 @@ def test_parameters_of_another_shape_are_refused():
 
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 def test_a_fixed_scale_keeps_the_order(activation):
-    free = RewardConfig(activation=activation, pin="none")
-    unit = RewardConfig(activation=activation, pin="unit")
+    free = RewardConfig(activation=activation, scale_constraint="none")
+    unit = RewardConfig(activation=activation, scale_constraint="unit")
     params, x = drawn(free), trajectories(50)
     unit_values = values(params, x, unit)
     if activation == "tanh":
@@ -133,8 +133,8 @@ def test_a_free_rank_loss_has_no_lower_bound_and_one_of_fixed_scale_has():
     human = jnp.asarray(rng.normal(1.0, 0.1, (8, T, F)), jnp.float32)
     others = jnp.asarray(rng.normal(-1.0, 0.1, (8, 5, T, F)), jnp.float32)
 
-    def loss(scale, pin):
-        config = RewardConfig(hidden=(), pin=pin)
+    def loss(scale, constraint):
+        config = RewardConfig(hidden=(), scale_constraint=constraint)
         params = init_params(jax.random.key(0), F, config)
         params["point"] = {"out": {"kernel": scale * jnp.ones((F, 1))}}
         v, w = (values(params, x, config) for x in (human, others))
@@ -209,9 +209,9 @@ def test_first_parameters():
     ("given", "says"),
     [
         ({"activation": "step"}, "activation: step: expected one of"),
-        ({"pin": "loose"}, "pin: loose: expected one of"),
+        ({"scale_constraint": "loose"}, "scale_constraint: loose: expected one of"),
         ({"hidden": (15,), "constraint": "nonnegative"}, "hidden: "),
-        ({"context": (1, 0)}, "context: 2 columns: expected 21"),
+        ({"scene_gating": (1, 0)}, "scene_gating: 2 columns: expected 21"),
         ({"module": "no_such_room:Reward"}, "no_such_room.*No module named"),
         ({"module": "json:Reward"}, "no attribute"),
         ({"module": "json:JSONDecoder"}, "no flax.linen.Module"),
@@ -219,7 +219,10 @@ def test_first_parameters():
         ({"module": "Reward"}, "expected package.module:Class"),
         ({"module": "tests.reward.others:Wide"}, r"\(2, 18, 3\) of \(2, 18, 21\): "),
         ({"module": "tests.reward.others:Stateful"}, r"\['batch_stats', 'params'\]"),
-        ({"module": "tests.reward.others:Nameless"}, "pin: unit.*last layer `out`"),
+        (
+            {"module": "tests.reward.others:Nameless"},
+            "scale_constraint: unit.*last layer `out`",
+        ),
         (
             {"module": "tests.reward.others:Wide", "constraint": "monotone"},
             "constraint: monotone: expected none",
@@ -232,7 +235,7 @@ def test_what_does_not_fit_is_one_line(given, says):
 
 
 def test_a_module_without_an_out_layer_trains_free():
-    made = RewardConfig(module="tests.reward.others:Nameless", pin="none")
+    made = RewardConfig(module="tests.reward.others:Nameless", scale_constraint="none")
     assert set(init_params(jax.random.key(0), F, made)) == {"gamma", "point"}
     assert user_module(made.module) is user_module(made.module)
     with pytest.raises(InputError, match=r"weights\.msgpack"):

@@ -21,7 +21,9 @@ from rcirl_jax.simulation.suite import build, suite_refs
 
 FEATURES = feature_map("paper21")
 NEVER = ("stop_distance", "stop_speed", "virtual_distance", "virtual_speed")
-BY_CONTEXT = RewardConfig(hidden=(32, 16), pin="none", context=FEATURES.context)
+GATED = RewardConfig(
+    hidden=(32, 16), scale_constraint="none", scene_gating=FEATURES.context
+)
 
 
 def rows(count=4000):
@@ -51,7 +53,7 @@ def redrawn(params, seed):
 
 def weights():
     key = jax.random.key(1)
-    params = init_params(key, FEATURES.num_features, BY_CONTEXT)
+    params = init_params(key, FEATURES.num_features, GATED)
     shape = params["scene_gating"].shape
     params["scene_gating"] = 0.1 * jax.random.normal(key, shape)
     return params, fit_normaliser(rows(), FEATURES)
@@ -76,7 +78,7 @@ def test_their_weights_change_no_value_and_get_no_gradient(seed):
     params, norm = weights()
     x = np.random.default_rng(seed).uniform(-50.0, 120.0, (7, 18, 21))
     x, valid = jnp.asarray(x, jnp.float32), jnp.ones((7, 18), bool)
-    of = lambda p: value(RewardModel(BY_CONTEXT), p, norm, x, valid)  # noqa: E731
+    of = lambda p: value(RewardModel(GATED), p, norm, x, valid)  # noqa: E731
     np.testing.assert_array_equal(of(params), of(redrawn(params, seed)))
     grad = jax.grad(lambda p: jnp.sum(of(p) ** 2))(params)
     at = [FEATURES.names.index(name) for name in NEVER]

@@ -22,7 +22,7 @@ OTHER = RewardConfig(module="tests.reward.others:Residual")
 @pytest.mark.parametrize("loss", ["rank", "gan"])
 @pytest.mark.parametrize("context", [(), FEATURES.context])
 def test_learns_a_direction(loss, context):
-    reward = dataclasses.replace(OTHER, context=context)
+    reward = dataclasses.replace(OTHER, scene_gating=context)
     config = dataclasses.replace(
         CONFIG, reward=reward, loss=loss, learning_rate=0.03, weight_decay=1e-3
     )

@@ -26,7 +26,9 @@ def test_the_three_recipes_say_what_decides_a_run():
     for name in recipe_names():
         body = load_toml(spec_root() / "recipes" / f"{name}.toml")
         assert needed <= set(body["train"]), name
-        assert {"hidden", "pin", "by_context"} <= set(body["train"]["reward"]), name
+        assert {"hidden", "scale_constraint", "scene_gating"} <= set(
+            body["train"]["reward"]
+        ), name
         assert "require_speed_change" in body["collect"], name
         assert "expert" in body["simulated_demonstrations"], name
 
@@ -37,7 +39,7 @@ def test_the_papers_own_setting():
     assert (train.loss, train.leaky_rate, train.epochs) == ("rank", 0.05, 2)
     assert (train.positive, train.futures) == ("human", "recorded")
     assert train.reward.hidden == (15,)
-    assert not train.reward.context
+    assert not train.reward.scene_gating
     assert recipe.simulated.expert == "none"
     assert recipe.collect.require_obstacles
     assert recipe.collect.require_speed_change
@@ -51,7 +53,10 @@ def test_the_papers_own_setting():
         ("[train]\nepochs = 'many'", r"epochs: many: expected a whole number"),
         ("[train]\nepochs = 0", r"epochs: 0: expected >= 1"),
         ("[train.reward]\nhidden = 15", r"hidden: 15: expected a list"),
-        ("[train.reward]\nby_context = 1", r"by_context: 1: expected true or false"),
+        (
+            "[train.reward]\nscene_gating = 1",
+            r"scene_gating: 1: expected true or false",
+        ),
         (
             "[simulated_demonstrations]\nexpert = 'nobody'",
             r"expert: nobody: expected one of",
@@ -98,7 +103,7 @@ for given in {given}:
     with flagsaver.flagsaver():
         flags.FLAGS(["x", *given])
         c, r = asked.config(), asked.config().reward
-        print(c.loss, r.hidden, c.leaky_rate, c.futures, c.positive, r.pin)
+        print(c.loss, r.hidden, c.leaky_rate, c.futures, c.positive, r.scale_constraint)
 """
 SWEEP = """
 from pathlib import Path
@@ -130,12 +135,12 @@ def said(code, *given):
 
 def test_a_flag_given_beside_the_recipe_wins():
     paper, usual = ["--recipe=paper"], load_recipe("tuned").train
-    changed = [*paper, "--loss=hinge", "--hidden_size=8,4", "--pin=none"]
+    changed = [*paper, "--loss=hinge", "--hidden_size=8,4", "--scale_constraint=none"]
     assert said(FLAGS, paper, changed, []) == [
         "rank (15,) 0.05 recorded human unit",
         "hinge (8, 4) 0.05 recorded human none",
         f"{usual.loss} {usual.reward.hidden} {usual.leaky_rate} {usual.futures} "
-        f"{usual.positive} {usual.reward.pin}",
+        f"{usual.positive} {usual.reward.scale_constraint}",
     ]
 
 
@@ -143,16 +148,16 @@ def test_a_sweep_trains_as_the_recipe_says(tmp_path):
     own = write(
         tmp_path,
         "[train]\nloss = 'rank'\nepochs = 7\npositive = 'human'\n"
-        "learning_rate = 0.001\n[train.reward]\npin = 'none'",
+        "learning_rate = 0.001\n[train.reward]\nscale_constraint = 'none'",
     )
     made, plain, few = said(
         SWEEP,
         [f"--recipe={own}", "--positive=nearest"],
         [],
-        ["--constraint=nonnegative", "--hidden_sizes=0", "--noby_context"],
+        ["--constraint=nonnegative", "--hidden_sizes=0", "--noscene_gating"],
     )
     for words in (
-        "epochs=7, positive='nearest'", "train_horizon=8.0", "pin='none'",
+        "epochs=7, positive='nearest'", "train_horizon=8.0", "scale_constraint='none'",
         "leaky_rates=(0.01, 0.05, 0.2), learning_rates=(0.001,)", "horizon_s=5.0",
     ):  # fmt: skip
         assert words in made

@@ -123,7 +123,7 @@ def suggestions(folder: Path) -> Target:
 
 def weights(folder: Path) -> Target:
     """Weights files with and without scene gating and a prior cost."""
-    kinds = ({}, {"by_context": True}, {"by_context": True, "with_prior": True})
+    kinds = ({}, {"scene_gating": True}, {"scene_gating": True, "with_prior": True})
     files = [folder / f"{number}.msgpack" for number in range(len(kinds))]
     for file, kind in zip(files, kinds, strict=True):
         file.write_bytes(packed(hidden=(2,), features=2, times=2, **kind))

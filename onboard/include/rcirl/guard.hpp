@@ -39,7 +39,7 @@ class Guard {
         times_(reward.times().size()),
         limit_(limits.share) {
     const detail::Network& network = reward.weights_.network;
-    const std::vector<float>& seen = reward.weights_.seen;
+    const std::vector<float>& seen = reward.weights_.training_range;
     for (std::size_t f = 0; f < features_; ++f) {
       const double scale = static_cast<double>(network.scale[f]);
       const double first = static_cast<double>(seen[f]), margin = limits.margin * scale;

@@ -35,7 +35,7 @@ from rcirl_jax.train.sweep import Fitted, fit, freeze, members_of
 # values cannot grow to the spread that a logistic or listwise loss asks for. "Free"
 # says the same of the paper's network, whatever the loss; the rank loss has no such
 # row, for it is homogeneous in the scale.
-FREE = {"pin": "none"}
+FREE = {"scale_constraint": "none"}
 LINEAR = {"hidden": (), **FREE}
 COSTS = {**LINEAR, "constraint": "nonnegative"}
 MONOTONE = {"constraint": "monotone"}
@@ -129,7 +129,7 @@ def learner_config(name: str, base: TrainConfig) -> TrainConfig:
     if reward.constraint == "monotone":
         reward = dataclasses.replace(reward, signs=features.signs)
     if name in BY_CONTEXT:
-        reward = dataclasses.replace(reward, context=features.context)
+        reward = dataclasses.replace(reward, scene_gating=features.context)
     return dataclasses.replace(config, reward=reward)
 
 

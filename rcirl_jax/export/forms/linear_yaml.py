@@ -44,7 +44,7 @@ def linear_costs(reward: Reward) -> tuple[np.ndarray, np.ndarray]:
       InputError: the reward is not linear, or not in departures from the usual.
     """
     where = f"{reward.file}: layers"
-    if reward.context is not None:
+    if reward.scene_gating is not None:
         raise InputError(f"{where}: by context: expected a linear reward")
     scale, kernels = np.asarray(reward.scale, np.float64), reward.kernels
     if len(kernels) == 1:

@@ -68,9 +68,9 @@ def _model(onnx, reward: Reward) -> "onnx.ModelProto":  # noqa: ANN001
     x = graph.node("Min", x, limits["upper"])
     x = graph.node("Sub", x, limits["location"])
     x = graph.node("Div", x, limits["scale"])
-    if reward.context is not None:
+    if reward.scene_gating is not None:
         first = graph.node("Gather", x, graph.constant("first", np.array([0])), axis=1)
-        context = graph.constant("context", np.asarray(reward.context, single))
+        context = graph.constant("context", np.asarray(reward.scene_gating, single))
         gain = graph.node("Sigmoid", graph.node("MatMul", first, context))
         gain = graph.node("Mul", gain, graph.constant("two", np.array(2.0, single)))
         x = graph.node("Mul", x, gain)

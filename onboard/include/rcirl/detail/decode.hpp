@@ -32,10 +32,10 @@ namespace detail {
 struct Weights {
   std::string sha256;  // of the body; names this reward
   std::string preset;
-  std::vector<Feature> features;  // [F]
-  std::vector<float> times;       // [T] s
-  std::vector<float> seen;        // [2, F] ends of the training's range
-  PriorCost prior_cost;           // or empty
+  std::vector<Feature> features;      // [F]
+  std::vector<float> times;           // [T] s
+  std::vector<float> training_range;  // [2, F] ends of the training's range
+  PriorCost prior_cost;               // or empty
   Network network;
 };
 
@@ -168,7 +168,7 @@ inline bool verify(Checks& is, const Node& node, const Weights& weights) {
         }))) {
     return false;
   }
-  if ((added || !network.context.empty()) &&
+  if ((added || !network.scene_gating.empty()) &&
       !is.every("samples.valid", valid, "1 at the first time",
                 [&](float v, std::size_t i) { return i % times != 0 || v > 0.0f; })) {
     return false;
@@ -223,13 +223,13 @@ inline bool decode_body(Checks& is, const Node& root, Weights* weights) {
   }
   const std::size_t size = network.features = weights->features.size();
   const bool gated = body[9]->kind != Kind::kNil, added = body[10]->kind != Kind::kNil;
-  Array context, seen, gamma;
+  Array scene_gating, training_range, gamma;
   double slope = 0.0;
   if (!(decode_normaliser(is, *body[2], &network) &&
         decode_times(is, *body[4], &weights->times) &&
         decode_activation(is, *body[7], &network.activation) &&
-        (!gated || is.array("scene_gating", *body[9], {size, size}, &context)) &&
-        decode_seen(is, *body[3], size, &seen) && decode_loss(is, *body[11]) &&
+        (!gated || is.array("scene_gating", *body[9], {size, size}, &scene_gating)) &&
+        decode_seen(is, *body[3], size, &training_range) && decode_loss(is, *body[11]) &&
         is.text("preset", *body[0], &weights->preset) &&
         is.array("gamma", *body[5], {weights->times.size()}, &gamma) &&
         decode_layers(is, *body[6], &network) &&
@@ -238,8 +238,8 @@ inline bool decode_body(Checks& is, const Node& root, Weights* weights) {
         is.plain("provenance", *body[12], kMaxDepth))) {
     return false;
   }
-  weights->seen = std::move(seen.values);
-  network.context = std::move(context.values);
+  weights->training_range = std::move(training_range.values);
+  network.scene_gating = std::move(scene_gating.values);
   network.gamma = std::move(gamma.values);
   network.leaky_slope = narrow(slope);
   return verify(is, *body[13], *weights);

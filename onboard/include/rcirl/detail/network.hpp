@@ -1,7 +1,7 @@
 // The score of docs/weights_format.md, 32 candidates side by side.
 //
 //   x_t = (clip(f_t, lower, upper) - location) / scale
-//   x_t <- x_t * 2 / (1 + exp(-x_0 C))                    with a context only
+//   x_t <- x_t * 2 / (1 + exp(-x_0 C))                    with scene gating only
 //   r_t = act(... act(x_t W_0 + b_0) ...) W_{L-1} + b_{L-1}
 //   V   = sum over valid t of gamma_t r_t
 //
@@ -41,7 +41,7 @@ struct Network {
   std::size_t features = 0;                         // F
   std::vector<float> lower, upper, location, scale;  // [F]
   std::vector<float> gamma;                          // [T]
-  std::vector<float> context;                        // [F, F], or empty
+  std::vector<float> scene_gating;                   // [F, F], or empty
   std::vector<Layer> layers;                         // F -> ... -> 1
   Activation activation = Activation::kIdentity;
   float leaky_slope = 0.0f;
@@ -55,7 +55,7 @@ struct Network {
   }
 
   // Lanes that `score` works in: the inputs and outputs of a layer, and the gains.
-  std::size_t work_size() const { return 2 * width() + (context.empty() ? 0 : features); }
+  std::size_t work_size() const { return 2 * width() + (scene_gating.empty() ? 0 : features); }
 };
 
 // [T] (stride 0) or [K, T] (stride T) of 0 and 1; no data: every time is valid.
@@ -167,7 +167,7 @@ inline void context_gains(const Network& network, const Lanes* x, Lanes* gains) 
   for (std::size_t j = 0; j < size; ++j) {
     float sum[kLanes] = {};
     for (std::size_t i = 0; i < size; ++i) {
-      const float weight = network.context[i * size + j];
+      const float weight = network.scene_gating[i * size + j];
       for (std::size_t k = 0; k < kLanes; ++k) sum[k] += weight * x[i].at[k];
     }
     for (std::size_t k = 0; k < kLanes; ++k) {
@@ -201,12 +201,12 @@ inline void score_block(const Network& network, const float* features, std::size
       rows[k] = features + (lane * times + t) * size;
       const unsigned mark = valid.data ? valid.data[lane * valid.stride + t] : 1u;
       counts[k] = mark == 1;
-      refused[k] |= mark > 1 || (mark == 0 && t == 0 && !network.context.empty());
+      refused[k] |= mark > 1 || (mark == 0 && t == 0 && !network.scene_gating.empty());
       any |= counts[k];
     }
     if (!any) continue;
     normalise(network, rows, x);
-    if (!network.context.empty()) {
+    if (!network.scene_gating.empty()) {
       if (t == 0) context_gains(network, x, gains);
       for (std::size_t f = 0; f < size; ++f) {
         for (std::size_t k = 0; k < kLanes; ++k) x[f].at[k] *= gains[f].at[k];
