@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.data.store.dataset import Demonstrations
-from rcirl_jax.data.store.rows import check_finite, refuse_scenes
+from rcirl_jax.data.store.rows import check_some, refuse_scenes
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.features.columns import Frame, candidate_frames
 from rcirl_jax.planner.prediction import select_future, with_predicted_futures
@@ -198,10 +198,10 @@ def in_chunks(
       stored: [S] dataset row of each scene, where that is not `index`.
 
     Raises:
-      InputError: a stored number or a feature is NaN or infinite (names the scene).
+      InputError: no scenes, or a feature is NaN or infinite (names the scene).
     """
     stored = index if stored is None else stored
-    check_finite("train", rows, stored)
+    check_some("train", index)
     for start in range(0, index.size, CHUNK):
         # the last chunk is filled up: one shape to compile
         at = np.minimum(np.arange(start, start + CHUNK), index.size - 1)

@@ -119,13 +119,22 @@ def refuse_scenes(
         )
 
 
-def check_finite(what: str, rows: Demonstration, index: np.ndarray) -> None:
-    """Refuses, as `refuse_scenes`, scenes (numpy) that hold a NaN, or no scene."""
+def check_some(what: str, index: np.ndarray) -> None:
+    """Refuses a split without scenes.
+
+    Raises:
+      InputError: `index` is empty.
+    """
     if len(index) == 0:
         raise InputError(
             f"{what}: 0 scenes: expected at least one; import with test_fraction "
             "above 0, or more recordings"
         )
+
+
+def check_finite(what: str, rows: Demonstration, index: np.ndarray) -> None:
+    """`refuse_scenes` for what n scenes (numpy) hold themselves, or if n is 0."""
+    check_some(what, index)
     bad = {
         name: ~np.isfinite(leaf).reshape(len(index), -1).all(axis=1)
         for name, leaf in named_leaves(rows).items()
