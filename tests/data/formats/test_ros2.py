@@ -137,16 +137,11 @@ def test_the_ego_by_tf(tmp_path):
     messages = []
     for t in times():
         place, _ = fixture.rear_axle(t)
+        way = {"translation": place["position"], "rotation": place["orientation"]}
+        frames = (("/map", "base_link"), ("base_link", "camera"))
         transforms = [
-            {
-                "header": fixture.header(t, frame),
-                "child_frame_id": child,
-                "transform": {
-                    "translation": place["position"],
-                    "rotation": place["orientation"],
-                },
-            }
-            for frame, child in (("/map", "base_link"), ("base_link", "camera"))
+            {"header": fixture.header(t, on), "child_frame_id": of, "transform": way}
+            for on, of in frames
         ]
         messages.append(("/tf", "tf2_msgs/TFMessage", t, {"transforms": transforms}))
     topics = {"ego": [ODOMETRY, "/tf"], "obstacles": []}
@@ -159,10 +154,9 @@ def test_the_ego_by_tf(tmp_path):
 
 def test_who_drives(tmp_path):
     """Manual for a second, then not, then silent."""
-    kind = "autoware_vehicle_msgs/ControlModeReport"
     messages = [
-        (fixture.MODE, kind, t, fixture.control_mode(t, mode=4 if t < 1.0 else 1))
-        for t in times(2.0)
+        (fixture.MODE, fixture.CONTROL_MODE, t, fixture.control_mode(t, mode=mode))
+        for t, mode in ((t, 4 if t < 1.0 else 1) for t in times(2.0))
     ]
     topics = {**ALONE["topics"], "driver": fixture.MODE}
     both = sorted([*ego(6.0), *messages], key=lambda item: item[2])
@@ -246,13 +240,8 @@ def test_headings_that_are_not_known(tmp_path, availability):
 @pytest.mark.parametrize(
     ("number", "kind"),
     [
-        *(
-            (2, Kind.VEHICLE),
-            (5, Kind.VEHICLE),
-            (6, Kind.CYCLIST),
-            (8, Kind.PEDESTRIAN),
-        ),
-        *((9, Kind.STATIC), (0, Kind.VEHICLE), (10, None), (99, Kind.VEHICLE)),
+        *[(number, Kind.VEHICLE) for number in (2, 5, 0, 99)],
+        *[(6, Kind.CYCLIST), (8, Kind.PEDESTRIAN), (9, Kind.STATIC), (10, None)],
     ],
 )
 def test_classes_of_autoware(tmp_path, number, kind):
@@ -279,16 +268,10 @@ def carla(t):
         if name == "23":  # a cylinder: height, radius
             shape = {"type": 3, "dimensions": [1.8, 0.3]}
         twist = fixture.velocity(speed * math.cos(heading), speed * math.sin(heading))
-        found.append(
-            {
-                "header": fixture.header(t),
-                "id": 200 if name == "ego" else int(name),
-                "pose": fixture.pose(x, y, heading),
-                "twist": twist,
-                "shape": shape,
-                "classification": number,
-            }
-        )
+        about = {"header": fixture.header(t), "pose": fixture.pose(x, y, heading)}
+        about["id"] = 200 if name == "ego" else int(name)
+        about |= {"twist": twist, "shape": shape, "classification": number}
+        found.append(about)
     return {"header": fixture.header(t), "objects": found}
 
 
@@ -309,12 +292,9 @@ def detections(t, *, named="car", name="15", frame="map"):
         ego = fixture.road_users(np.array([t]))["ego"]
         ahead = user.x[0] - ego.x[0] + fixture.AHEAD
         place = fixture.pose(ahead, user.y[0] - ego.y[0], float(user.heading[0]))
-    results = [
-        {"hypothesis": {"class_id": "bicycle", "score": 0.1}},
-        {"hypothesis": {"class_id": named, "score": 0.8}},
-    ]
-    size = {"x": user.length, "y": user.width, "z": 1.5}
-    box = {"center": place, "size": size}
+    sure = [{"class_id": "bicycle", "score": 0.1}, {"class_id": named, "score": 0.8}]
+    results = [{"hypothesis": one} for one in sure]
+    box = {"center": place, "size": fixture.size_of(user)}
     found = [{"results": results, "bbox": box, "id": name}]
     return {"header": fixture.header(t, frame), "detections": found}
 

@@ -2,10 +2,10 @@
 
 A bag is a folder with metadata.yaml, or a file of its own. Of metadata.yaml only the
 list of files is read, line by line: rosbag2 writes one entry a line, and so no YAML
-library is needed. Files are MCAP (https://mcap.dev/spec, read by
-the library `mcap`; one that was never closed has no magic at its end and is refused,
-because nobody knows how much is missing) or rosbag2's SQLite storage. The definitions
-of messages are in the file; SQLite files from before ROS 2 Iron lack them.
+library is needed. Files are MCAP (https://mcap.dev/spec, read by the library `mcap`;
+one that was never closed has no magic at its end and is refused, because nobody knows
+how much is missing) or rosbag2's SQLite storage. The definitions of messages are in the
+file; SQLite files from before ROS 2 Iron lack them.
 """
 
 import contextlib
@@ -26,20 +26,20 @@ METADATA = "metadata.yaml"
 PATTERNS = ("*.mcap", "*.db3")
 PACKED = (".zstd", ".lz4")  # endings of files that rosbag2 compressed as a whole
 MAGIC = b"\x89MCAP0\r\n"
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 MAX_METADATA_BYTES = 64 * 2**20  # bytes; rosbag2 repeats the profiles of each topic
 MAX_MESSAGE_BYTES = 16 * 2**20  # bytes; decoded, a message takes many times its bytes
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 MAX_CHUNK_BYTES = 2**30  # bytes of one chunk of MCAP, unpacked or not
 MAX_SCHEMA_BYTES = 2**20  # bytes of a message's definition; the longest have 50 kB
 MAX_TOPICS = 100_000
 MAX_MESSAGES = 100_000_000
-SOUND = "a sound MCAP file; `mcap doctor FILE` says what is damaged"
 TOPICS = ("id", "name", "type", "serialization_format")
 MESSAGES = ("topic_id", "timestamp", "data")
 DEFINITIONS = ("topic_type", "encoding", "encoded_message_definition")
 
 # what the library decodes: attributes named as the definition in the file names them
 Message = SimpleNamespace
+Sent = tuple[str, int, bytes]  # topic, ns when it was recorded, content
 
 
 class Topic(NamedTuple):
@@ -49,7 +49,7 @@ class Topic(NamedTuple):
     encoding: str  # of its messages
     schema_encoding: str  # of the definition, "" without one
     schema: bytes  # the definition
-    messages: int | None  # their number; None: the file does not say it
+    is_silent: bool  # it has no messages
 
     @property
     def is_described(self) -> bool:
@@ -81,44 +81,39 @@ def files_in(bag: Path) -> list[Path]:
     """Lists the files of a bag, in the order of time.
 
     Raises:
-      InputError: packed by rosbag2, no files, or one that is missing.
+      InputError: packed as a whole by rosbag2, no files, or one that is missing.
     """
-    metadata = bag / METADATA
-    if bag.is_file() or not metadata.is_file():
-        return [_unpacked(bag)]
-    if (size := metadata.stat().st_size) > MAX_METADATA_BYTES:
-        raise InputError(
-            f"{metadata}: {size} bytes: expected at most {MAX_METADATA_BYTES}"
-        )
-    text = metadata.read_text(errors="replace")
-    listed = re.search(r"^ *relative_file_paths: *\n((?: *- .*\n?)*)", text, re.M)
-    lines = listed[1].splitlines() if listed else []
-    names = [line.strip()[2:].strip().strip("\"'") for line in lines]
-    if not names:
-        raise InputError(
-            f"{metadata}: relative_file_paths: none: expected the files of the bag; "
-            "write it anew with `ros2 bag reindex`"
-        )
-    files = []
-    for name in names:
-        # bags of Foxy name their folder as well; no file outside the bag is read
-        file = bag / Path(name).name
-        if not file.is_file():
+    files, metadata = [bag], bag / METADATA
+    if metadata.is_file():
+        where = f"{metadata}: relative_file_paths"
+        if (size := metadata.stat().st_size) > MAX_METADATA_BYTES:
             raise InputError(
-                f"{metadata}: relative_file_paths: {name[:200]}: missing: expected "
-                "this file in the bag; `ros2 bag reindex` lists those that are there"
+                f"{metadata}: {size} bytes: expected at most {MAX_METADATA_BYTES}"
             )
-        files.append(_unpacked(file))
+        text = metadata.read_text(errors="replace")
+        listed = re.search(r"^ *relative_file_paths: *\n((?: *- .*\n?)*)", text, re.M)
+        lines = listed[1].splitlines() if listed else []
+        # bags of Foxy name their folder as well; no file outside the bag is read
+        names = [Path(line.strip()[2:].strip().strip("\"'")).name for line in lines]
+        if not names:
+            raise InputError(
+                f"{where}: none: expected the files of the bag; write it anew with "
+                "`ros2 bag reindex`"
+            )
+        files = [bag / name for name in names]
+        for file in files:
+            if not file.is_file():
+                raise InputError(
+                    f"{where}: {file.name[:200]}: missing: expected this file in the "
+                    "bag; `ros2 bag reindex` lists those that are there"
+                )
+    for file in files:
+        if file.suffix in PACKED:
+            raise InputError(
+                f"{file}: compressed as a whole: expected .mcap or .db3; unpack it, "
+                "for example with `zstd -d`, and name the files so in metadata.yaml"
+            )
     return files
-
-
-def _unpacked(file: Path) -> Path:
-    if file.suffix in PACKED:
-        raise InputError(
-            f"{file}: compressed as a whole: expected .mcap or .db3; unpack it, for "
-            "example with `zstd -d`, and name the files so in metadata.yaml"
-        )
-    return file
 
 
 # ------------------------------------------------------------------- storages
@@ -130,8 +125,8 @@ class BagFile(NamedTuple):
     topics: dict[str, Topic]  # by name
     # ns, when the first and the last message were recorded; None: not known
     span: tuple[int, int] | None
-    # topics wanted -> (topic, ns, bytes) in the order of recording
-    messages: Callable[[Collection[str]], Iterator[tuple[str, int, bytes]]]
+    # messages of the wanted topics in the order of recording
+    messages: Callable[[Collection[str]], Iterator[Sent]]
 
 
 @contextlib.contextmanager
@@ -146,57 +141,52 @@ def open_file(path: Path) -> Iterator[BagFile]:
 
 
 def _of_mcap(path: Path, stream: BinaryIO) -> BagFile:
-    head = stream.read(len(MAGIC))
+    head, size = stream.read(len(MAGIC)), stream.seek(0, io.SEEK_END)
     if head != MAGIC:
         raise InputError(
             f"{path}: begins with {head!r}: expected an MCAP file ({MAGIC!r})"
         )
-    size = stream.seek(0, io.SEEK_END)
     stream.seek(max(size - len(MAGIC), 0))
     if size < 2 * len(MAGIC) or stream.read() != MAGIC:
         raise InputError(
             f"{path}: no end after {size} bytes: expected a whole MCAP file; "
-            "truncated, or never closed? `mcap recover FILE -o NEW` keeps what is "
-            "sound"
+            "truncated, or never closed? `mcap recover FILE -o NEW` keeps what is sound"
         )
     stream.seek(0)
-    with _damaged(str(path), SOUND):
+    where, sound = str(path), "a sound MCAP file; `mcap doctor FILE` says what is wrong"
+    with _damaged(where, sound):
         reader = extra_module("mcap.reader", EXTRA).SeekingReader(
             stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES
         )
         summary = reader.get_summary()
-    for chunk in summary.chunk_indexes if summary else ():
-        size = max(chunk.uncompressed_size, chunk.compressed_size)
-        if size > MAX_CHUNK_BYTES:
-            raise InputError(
-                f"{path}: chunk at byte {chunk.chunk_start_offset}: {size} "
-                f"bytes: expected at most {MAX_CHUNK_BYTES}"
-            )
     if summary is None or not summary.channels:
         raise InputError(
             f"{path}: summary: no channels: expected a file with a summary section; "
             "`mcap recover FILE -o NEW` writes one"
         )
-    known = summary.statistics
-    counts = known and known.channel_message_counts
-    topics: dict[str, Topic] = {}
+    for chunk in summary.chunk_indexes:
+        size = max(chunk.uncompressed_size, chunk.compressed_size)
+        if size > MAX_CHUNK_BYTES:
+            raise InputError(
+                f"{path}: chunk at byte {chunk.chunk_start_offset}: {size} bytes: "
+                f"expected at most {MAX_CHUNK_BYTES}"
+            )
+    known, topics = summary.statistics, {}
+    counts = known.channel_message_counts if known else {}
     for key, channel in summary.channels.items():
         schema = summary.schemas.get(channel.schema_id)
-        topic = Topic(
-            type=schema.name if schema else "",
-            encoding=channel.message_encoding,
-            schema_encoding=schema.encoding if schema else "",
-            schema=schema.data if schema else b"",
-            messages=counts.get(key, 0) if counts else None,
-        )
+        encoding = channel.message_encoding
+        about = (schema.encoding, schema.data) if schema else ("", b"")
+        is_silent = bool(counts) and not counts.get(key, 0)
         # several publishers are several channels, of which some may be silent
-        if topic.messages != 0 or channel.topic not in topics:
-            topics[channel.topic] = topic
+        if not is_silent or channel.topic not in topics:
+            kind = schema.name if schema else ""
+            topics[channel.topic] = Topic(kind, encoding, *about, is_silent)
 
-    def messages(wanted: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+    def messages(wanted: Collection[str]) -> Iterator[Sent]:
         found = reader.iter_messages(topics=list(wanted))
         while True:
-            with _damaged(str(path), SOUND):
+            with _damaged(where, sound):
                 item = next(found, None)
             if item is None:
                 return
@@ -218,25 +208,23 @@ def _of_sqlite(database: Database) -> BagFile:
                     raise database.error(f"{table}.{name}", repr(cell)[:40], "a text")
         return rows
 
+    def ints(sql: str) -> list[int]:
+        found = database.chunks(sql, ("messages",), MAX_TOPICS)
+        return [row[0] for rows in found for row in rows if isinstance(row[0], int)]
+
     named = texts("topics", TOPICS)
     has_definitions = database.columns("message_definitions")
     rows = texts("message_definitions", DEFINITIONS) if has_definitions else ()
-    definitions = {kind: (encoding, text) for kind, encoding, text in rows}
-    sql = "SELECT DISTINCT topic_id FROM messages"
-    met = database.chunks(sql, ("messages.topic_id",), MAX_TOPICS)
-    used = {row[0] for rows in met for row in rows}
-    topics = {}
-    for key, name, kind, encoding in named:
-        how, text = definitions.get(kind, ("", ""))
-        count = None if key in used else 0
-        topics[name] = Topic(kind, encoding, how, text.encode(), count)
-    ends = []
-    for way in ("ASC", "DESC"):
-        sql = f"SELECT timestamp FROM messages ORDER BY timestamp {way} LIMIT 1"
-        found = database.chunks(sql, ("messages.timestamp",), 1)
-        ends += [row[0] for rows in found for row in rows if isinstance(row[0], int)]
+    definitions = {kind: (encoding, text.encode()) for kind, encoding, text in rows}
+    used = {*ints("SELECT DISTINCT topic_id FROM messages")}
+    topics = {
+        name: Topic(kind, encoding, *definitions.get(kind, ("", b"")), key not in used)
+        for key, name, kind, encoding in named
+    }
+    by_time = "SELECT timestamp FROM messages ORDER BY timestamp"
+    ends = [*ints(f"{by_time} LIMIT 1"), *ints(f"{by_time} DESC LIMIT 1")]
 
-    def messages(wanted: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+    def messages(wanted: Collection[str]) -> Iterator[Sent]:
         names = {key: name for key, name, *_ in named if name in wanted}
         sql = (
             "SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN "
@@ -247,10 +235,10 @@ def _of_sqlite(database: Database) -> BagFile:
             for key, logged, data in rows:
                 name = names[key]
                 if not isinstance(logged, int) or not isinstance(data, bytes):
-                    raise InputError(
-                        f"{database.path}: messages: message {numbers[name]} of "
-                        f"{name}: {type(logged).__name__}, {type(data).__name__}: "
-                        "expected a time in ns and bytes"
+                    raise database.error(
+                        f"messages: message {numbers[name]} of {name}",
+                        f"{type(logged).__name__}, {type(data).__name__}",
+                        "a time in ns and bytes",
                     )
                 numbers[name] += 1
                 yield name, logged, data
@@ -285,23 +273,23 @@ def decoder_of(path: Path, name: str, topic: Topic) -> Callable[[bytes], Message
     Raises:
       InputError: an encoding that is not ROS 2's, or no definition.
     """
-    where = f"{path}: {name} ({topic.type})"
+    where, size = f"{path}: {name} ({topic.type})", len(topic.schema)
+    wrong = ""
     if topic.encoding != "cdr":
-        raise InputError(
-            f"{where}: message_encoding: {topic.encoding!r}: expected cdr, which ROS 2 "
-            "writes; convert the topic, or name another in [topics] of the source TOML"
+        wrong = (
+            f"message_encoding: {topic.encoding!r}: expected cdr, which ROS 2 writes; "
+            "convert the topic, or name another in [topics] of the source TOML"
         )
-    if not topic.is_described:
-        raise InputError(
-            f"{where}: schema encoding: {topic.schema_encoding!r}: expected ros2msg, "
-            "the definition inside the file; record it anew with `ros2 bag convert` "
-            "where its package is installed"
+    elif not topic.is_described:
+        wrong = (
+            f"schema encoding: {topic.schema_encoding!r}: expected ros2msg, the "
+            "definition inside the file; record it anew with `ros2 bag convert` where "
+            "its package is installed"
         )
-    if len(topic.schema) > MAX_SCHEMA_BYTES:
-        raise InputError(
-            f"{where}: schema: {len(topic.schema)} bytes: expected at most "
-            f"{MAX_SCHEMA_BYTES}"
-        )
+    elif size > MAX_SCHEMA_BYTES:
+        wrong = f"schema: {size} bytes: expected at most {MAX_SCHEMA_BYTES}"
+    if wrong:
+        raise InputError(f"{where}: {wrong}")
     decoders = extra_module("mcap_ros2.decoder", EXTRA)
     schema = extra_module("mcap.records", EXTRA).Schema(
         id=1, name=topic.type, encoding="ros2msg", data=topic.schema

@@ -36,19 +36,15 @@ LEFT_OUT = -2  # kind of what a car drives over or under
 # ObjectClassification.label: CAR, TRUCK, BUS, TRAILER, MOTORCYCLE; BICYCLE;
 # PEDESTRIAN, ANIMAL; HAZARD; OVER_DRIVABLE, UNDER_DRIVABLE; 0 is UNKNOWN
 LABELS = {
-    **dict.fromkeys((1, 2, 3, 4, 5), int(Kind.VEHICLE)),
-    6: int(Kind.CYCLIST),
-    **dict.fromkeys((7, 8), int(Kind.PEDESTRIAN)),
-    9: int(Kind.STATIC),
+    **dict.fromkeys((1, 2, 3, 4, 5), Kind.VEHICLE),
+    **{6: Kind.CYCLIST, 7: Kind.PEDESTRIAN, 8: Kind.PEDESTRIAN, 9: Kind.STATIC},
     **dict.fromkeys((10, 11), LEFT_OUT),
 }
 # Object.classification: PEDESTRIAN; BIKE; CAR, TRUCK, MOTORCYCLE, OTHER_VEHICLE;
 # BARRIER, SIGN; 0 to 3 are UNKNOWN of several sizes
 CLASSES = {
-    4: int(Kind.PEDESTRIAN),
-    5: int(Kind.CYCLIST),
-    **dict.fromkeys((6, 7, 8, 9), int(Kind.VEHICLE)),
-    **dict.fromkeys((10, 11), int(Kind.STATIC)),
+    **{4: Kind.PEDESTRIAN, 5: Kind.CYCLIST, 10: Kind.STATIC, 11: Kind.STATIC},
+    **dict.fromkeys((6, 7, 8, 9), Kind.VEHICLE),
 }
 CYLINDER, POLYGON = 1, 2  # Shape.type
 BOX, SPHERE, CONE = 1, 2, 4  # SolidPrimitive.type; 3 is CYLINDER
@@ -82,13 +78,15 @@ class Context:
             )
         return found == self.base_frame
 
-    def pose(self, position: Message, orientation: Message) -> Pose:
+    def pose(
+        self, position: Message, orientation: Message, *, is_ego: bool = False
+    ) -> Pose:
         """Returns a place from a point and a quaternion of any length.
 
             heading = atan2(2 (w z + x y), w^2 + x^2 - y^2 - z^2)
 
         Raises:
-          InputError: a number that is not finite.
+          InputError: a number that is not finite, or a heading of the ego not set.
         """
         x, y, q = position.x, position.y, orientation
         for name, value in {"x": x, "y": y, "w": q.w, "z": q.z}.items():
@@ -98,18 +96,12 @@ class Context:
                     f"{self.where}: {field}.{name}: {value}: expected a finite number"
                 )
         if not any((q.x, q.y, q.z, q.w)):
+            if is_ego:
+                found = "all zero: expected the ego's quaternion"
+                raise InputError(f"{self.where}: orientation: {found}")
             return x, y, NAN
         ahead = q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z
         return x, y, math.atan2(2.0 * (q.w * q.z + q.x * q.y), ahead)
-
-    def pose_of_ego(self, position: Message, orientation: Message) -> Pose:
-        """Returns a place whose heading has to be known."""
-        pose = self.pose(position, orientation)
-        if math.isnan(pose[2]):
-            raise InputError(
-                f"{self.where}: orientation: all zero: expected the ego's quaternion"
-            )
-        return pose
 
 
 def _stamp(stamp: Message) -> float:
@@ -126,7 +118,7 @@ def _length(vector: Message) -> float:
 
 def _ego(pose: str, speed: str = "") -> Reader:
     """Messages of one pose; `speed` leads to a velocity whose length is the speed."""
-    pose_of = attrgetter(pose)
+    pose_of, velocity_of = attrgetter(pose), attrgetter(speed or "header")
 
     def rows(message: Message, context: Context) -> Iterator[Row]:
         if context.check_frame(message.header.frame_id):
@@ -136,8 +128,8 @@ def _ego(pose: str, speed: str = "") -> Reader:
                 "source TOML)"
             )
         place = pose_of(message)
-        known = _length(attrgetter(speed)(message)) if speed else NAN
-        found = context.pose_of_ego(place.position, place.orientation)
+        known = _length(velocity_of(message)) if speed else NAN
+        found = context.pose(place.position, place.orientation, is_ego=True)
         yield _stamp(message.header.stamp), *found, known
 
     return rows
@@ -149,38 +141,37 @@ def _transforms(message: Message, context: Context) -> Iterator[Row]:
         frames = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
         if frames == (context.map_frame, context.base_frame):
             place = one.transform
-            found = context.pose_of_ego(place.translation, place.rotation)
+            found = context.pose(place.translation, place.rotation, is_ego=True)
             yield _stamp(one.header.stamp), *found, NAN
 
 
 def _velocity(velocity: str) -> Reader:
     velocity_of = attrgetter(velocity)
-    return lambda message, context: iter(
+    return lambda message, _: iter(
         [(_stamp(message.header.stamp), _length(velocity_of(message)))]
     )
 
 
-def _control_mode(message: Message, context: Context) -> Iterator[Row]:
+def _control_mode(message: Message, _: Context) -> Iterator[Row]:
     yield _stamp(message.stamp), float(message.mode == MANUAL)
 
 
 def _lights(stamp: str, groups: str, name: str, elements: str) -> Reader:
-    """Messages of lights: places of the time, the groups, and of each id and lamps."""
+    """Messages of lights: places of the time, the groups, and of each id and lamps.
+
+    The state is the place in STATES of the surest round light, else of the surest one.
+    """
     stamp_of, parts = attrgetter(stamp), attrgetter(name, elements)
 
-    def rows(message: Message, context: Context) -> Iterator[Row]:
+    def rows(message: Message, _: Context) -> Iterator[Row]:
         t = _stamp(stamp_of(message))
         for number, lamps in map(parts, getattr(message, groups)):
-            yield t, float(number), _state(lamps)
+            lit = [e for e in lamps if e.color in COLOURS and e.status not in OFF]
+            lit.sort(key=lambda e: (e.shape in CIRCLES, e.confidence), reverse=True)
+            colour = COLOURS[lit[0].color] if lit else "off"
+            yield t, float(number), float(STATES.index(colour))
 
     return rows
-
-
-def _state(elements: list) -> float:
-    """Place in STATES of the surest round light, else of the surest one; lit ones."""
-    lit = [e for e in elements if e.color in COLOURS and e.status not in OFF]
-    best = max(lit, key=lambda e: (e.shape in CIRCLES, e.confidence), default=None)
-    return float(0 if best is None else STATES.index(COLOURS[best.color]))
 
 
 # ------------------------------------------------------------------ obstacles
@@ -224,7 +215,7 @@ def _autoware(pose: str, twist: str) -> Reader:
 
     def rows(message: Message, context: Context) -> Iterator[Row]:
         for one in message.objects:
-            how = one.kinematics
+            how, shape = one.kinematics, one.shape
             place, velocity = pose_of(how), twist_of(how)
             x, y, heading = context.pose(place.position, place.orientation)
             known = getattr(how, "orientation_availability", None)
@@ -232,31 +223,25 @@ def _autoware(pose: str, twist: str) -> Reader:
                 heading = NAN
             elif known == HAS_NO_SIGN and velocity.x < 0.0:
                 heading += math.pi
-            yield _of_autoware(message, context, one, (x, y, heading), velocity)
+            best = max(one.classification, key=lambda c: c.probability, default=None)
+            kind = UNKNOWN if best is None else LABELS.get(best.label, UNKNOWN)
+            size = shape.dimensions.x, shape.dimensions.y
+            if shape.type == CYLINDER:
+                size = (shape.dimensions.x, shape.dimensions.x)
+            elif shape.type == POLYGON and shape.footprint.points:
+                # in the object's frame; its place need not be in its box's middle
+                ahead = [point.x for point in shape.footprint.points]
+                left = [point.y for point in shape.footprint.points]
+                size = (max(ahead) - min(ahead), max(left) - min(left))
+                u, v = 0.5 * (max(ahead) + min(ahead)), 0.5 * (max(left) + min(left))
+                turn = 0.0 if math.isnan(heading) else heading
+                cos, sin = math.cos(turn), math.sin(turn)
+                x, y = x + cos * u - sin * v, y + sin * u + cos * v
+            name, pose = bytes(one.object_id.uuid).hex(), (x, y, heading)
+            speed = _length(velocity)
+            yield _obstacle(message, context, name, pose, speed, size, kind)
 
     return rows
-
-
-def _of_autoware(
-    message: Message, context: Context, one: Message, pose: Pose, twist: Message
-) -> Row:
-    best = max(one.classification, key=lambda c: c.probability, default=None)
-    kind = UNKNOWN if best is None else LABELS.get(best.label, UNKNOWN)
-    shape, size = one.shape, (one.shape.dimensions.x, one.shape.dimensions.y)
-    if shape.type == CYLINDER:
-        size = (shape.dimensions.x, shape.dimensions.x)
-    elif shape.type == POLYGON and shape.footprint.points:
-        # in the object's frame; its box need not have the object's place in its middle
-        ahead = [point.x for point in shape.footprint.points]
-        left = [point.y for point in shape.footprint.points]
-        size = (max(ahead) - min(ahead), max(left) - min(left))
-        u, v = 0.5 * (max(ahead) + min(ahead)), 0.5 * (max(left) + min(left))
-        x, y, heading = pose
-        turn = 0.0 if math.isnan(heading) else heading
-        cos, sin = math.cos(turn), math.sin(turn)
-        pose = x + cos * u - sin * v, y + sin * u + cos * v, heading
-    name, speed = bytes(one.object_id.uuid).hex(), _length(twist)
-    return _obstacle(message, context, name, pose, speed, size, kind)
 
 
 def _derived(message: Message, context: Context) -> Iterator[Row]:
@@ -270,11 +255,9 @@ def _derived(message: Message, context: Context) -> Iterator[Row]:
             size = sizes[0], sizes[1]
         elif BOX < shape <= CONE and len(sizes) > place:
             size = (2.0 * sizes[place],) * 2
-        speed, kind = (
-            _length(one.twist.linear),
-            CLASSES.get(one.classification, UNKNOWN),
-        )
-        yield _obstacle(message, context, str(one.id), pose, speed, size, kind)
+        kind, name = CLASSES.get(one.classification, UNKNOWN), str(one.id)
+        speed = _length(one.twist.linear)
+        yield _obstacle(message, context, name, pose, speed, size, kind)
 
 
 def _detections(message: Message, context: Context) -> Iterator[Row]:
@@ -297,9 +280,8 @@ def _detections(message: Message, context: Context) -> Iterator[Row]:
         if best is not None:
             label = best.class_id if hasattr(best, "class_id") else best.id
             kind = int(kind_of(where, label, context.kinds))
-        box = one.bbox
-        pose = context.pose(box.center.position, box.center.orientation)
-        size = box.size.x, box.size.y
+        pose = context.pose(one.bbox.center.position, one.bbox.center.orientation)
+        size = one.bbox.size.x, one.bbox.size.y
         yield _obstacle(message, context, name, pose, NAN, size, kind)
 
 

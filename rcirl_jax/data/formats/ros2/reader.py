@@ -119,7 +119,7 @@ class BagDrive(Drive):
         for file in self.files:
             with open_file(file) as opened:
                 for name, topic in opened.topics.items():
-                    if topic.messages != 0:
+                    if not topic.is_silent:
                         known.setdefault(name, topic)
         roles = {}
         for role, names in topics_of(self.spec, dict.fromkeys(TYPES, ())).items():

@@ -44,15 +44,6 @@ MAX_COLOURS = 50_000_000  # lanes by steps; 1000 lanes over an hour take 36 mill
 GAP_S = 2.0  # s, a signal unseen for so long kept its colour if it has it again
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Stop:
-    """What the map and the signals say about stopping on one lane."""
-
-    points: dict[int, np.ndarray]  # lane id -> [2] m
-    signals: frozenset[int]  # lane ids with a signal
-    signs: frozenset[int]  # lane ids that demand a stop at any time
-
-
 def read_map(
     where: str, scenario: Message, t: np.ndarray, origin: np.ndarray, spec: dict
 ) -> tuple[tuple[Lane, ...], tuple[Signal, ...], list[str]]:
@@ -66,16 +57,20 @@ def read_map(
       spec: source TOML.
     """
     features = scenario.map_features
-    signals, points, flashing = _signals(
-        where, scenario.dynamic_map_states, t, origin, spec
-    )
+    steps = scenario.dynamic_map_states
+    signals, points, flashing = _signals(where, steps, t, origin, spec)
     signs = _stop_signs(where, features, origin)
-    stops = _Stop(
-        points={**signs, **points},
-        signals=frozenset(int(signal.id) for signal in signals),
-        signs=frozenset(signs) | flashing,
+    lanes, notes = _lanes(where, features, {**signs, **points}, origin, spec)
+    lit = {signal.id for signal in signals}
+    signed = {str(key) for key in signs.keys() | flashing}
+    lanes = tuple(
+        dataclasses.replace(
+            lane,
+            signal_ids=(lane.id,) if lane.id in lit else (),
+            stop_sign=lane.id in signed,
+        )
+        for lane in lanes
     )
-    lanes, notes = _lanes(where, features, stops, origin, spec)
     return lanes, signals, notes
 
 
@@ -117,11 +112,11 @@ def _polylines(
 def _lanes(
     where: str,
     features: Sequence[Message],
-    stops: _Stop,
+    stops: Mapping[int, np.ndarray],
     origin: np.ndarray,
     spec: dict,
-) -> tuple[tuple[Lane, ...], list[str]]:
-    """Lanes of the wanted types and of two or more points."""
+) -> tuple[list[Lane], list[str]]:
+    """Lanes of the wanted types and of two or more points; stops [2] m by lane id."""
     every = _by_id(where, features, "lane")
     wanted = lane_types(spec, tuple(LANE_TYPES.values()), DRIVEN)
     driven = {
@@ -150,7 +145,7 @@ def _lanes(
         usual = np.full(len(line), default)
         sides = [usual if half is None else half[keep] for half in found]
         across, limit = None, head.speed_limit_mph  # zero: unknown
-        if (point := stops.points.get(key)) is not None:
+        if (point := stops.get(key)) is not None:
             across = line_across(line, sides[0], sides[1], point)
         if not 0.0 <= limit * MPH_MPS < MAX_SPEED_MPS:
             raise InputError(
@@ -166,8 +161,6 @@ def _lanes(
             successors=tuple(map(str, exits[key])),
             left=beside[0][row],
             right=beside[1][row],
-            signal_ids=(str(key),) if key in stops.signals else (),
-            stop_sign=key in stops.signs,
             stop_line=across,
             width_assumed=any(half is None for half in found),
         )
@@ -177,7 +170,7 @@ def _lanes(
         notes.append(f"{others} lanes not of type {', '.join(wanted)} left out")
     if short := len(driven) - len(heads):
         notes.append(f"{short} lanes of one point left out")
-    return tuple(lanes), notes
+    return lanes, notes
 
 
 def _half_widths(

@@ -92,15 +92,6 @@ EXPECTED = (
 )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _States:
-    """All states of a scenario as arrays [tracks, steps]."""
-
-    t: np.ndarray  # [steps] s
-    values: dict[str, np.ndarray]  # by field of ObjectState
-    valid: np.ndarray  # bool
-
-
 def parts(path: Path, spec: dict) -> list[Path]:
     """Lists the TFRecord files; each can be read alone."""
     return files_below(path, patterns(spec, PATTERNS), "TFRecord files")
@@ -127,21 +118,24 @@ def _read_scenario(where: str, default: str, data: bytes, spec: dict) -> Recordi
         raise InputError(f"{where}: {error}: expected {EXPECTED}") from error
     if not scenario.tracks:
         raise InputError(f"{where}: tracks: none: expected {EXPECTED}")
-    states = _states(where, scenario)
-    origin = local_origin(
-        states.values["center_x"][states.valid], states.values["center_y"][states.valid]
-    )
-    states.values["center_x"] -= origin[0]
-    states.values["center_y"] -= origin[1]
-    tracks, notes = _tracks(where, scenario, states, spec)
-    lanes, signals, map_notes = read_map(where, scenario, states.t, origin, spec)
+    t = _times(where, scenario)
+    values, valid = _states(where, scenario, t.size)
+    x, y = values["center_x"], values["center_y"]
+    origin = local_origin(x[valid], y[valid])
+    x -= origin[0]
+    y -= origin[1]
+    tracks, notes = _tracks(where, scenario, t, values, valid, spec)
+    lanes, signals, map_notes = read_map(where, scenario, t, origin, spec)
     name = scenario.scenario_id[:MAX_NAME] or default
     limits = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
+    if WINDOW_S[0] < t[-1] < WINDOW_S[1]:
+        shared = "9.1 s windows of one drive may share vehicles; training_20s has none"
+        notes = [shared, *notes]
     return Recording(
         name=name,
         source=str(spec.get("source", "Waymo Open Motion Dataset")),
         licence=str(spec.get("licence", "unknown")),
-        rate_hz=_rate(where, states.t),
+        rate_hz=RATE_HZ,
         tracks=tracks,
         lanes=lanes,
         signals=signals,
@@ -150,42 +144,43 @@ def _read_scenario(where: str, default: str, data: bytes, spec: dict) -> Recordi
         default_speed_limit=float(np.median(limits))
         if limits
         else number(spec, "speed_limit", LIMIT_MPS),
-        notes=(
-            *origin_notes(origin),
-            *_scenario_notes(scenario, states.t),
-            *notes,
-            *map_notes,
-        ),
+        notes=(*origin_notes(origin), *notes, *map_notes),
     )
 
 
-def _states(where: str, scenario: Message) -> _States:
+def _times(where: str, scenario: Message) -> np.ndarray:
+    """The time [steps] s of each step, since the first."""
     t = np.array(scenario.timestamps_seconds, np.float64)
+    field, span = f"{where}: timestamps_seconds", t[-1] - t[0] if t.size else 0.0
     if not t.size or not np.isfinite(t).all() or np.any(np.diff(t) <= 0.0):
+        found = f"{t[:4].tolist()} ({t.size})"
+        raise InputError(f"{field}: {found}: expected increasing times")
+    if span > MAX_SPAN_S:
+        raise InputError(f"{field}: {span:g} s: expected at most {MAX_SPAN_S:g} s")
+    rate = 1.0 / float(np.median(np.diff(t))) if t.size > 1 else RATE_HZ
+    if abs(rate / RATE_HZ - 1.0) > RATE_TOLERANCE:
+        raise InputError(f"{field}: {rate:g} per second: expected {RATE_HZ:g} (unit s)")
+    return t - t[0]
+
+
+def _states(
+    where: str, scenario: Message, steps: int
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Values [tracks, steps] by field of ObjectState, and which are valid."""
+    tracks = scenario.tracks
+    if len(tracks) * steps > MAX_STATES:
         raise InputError(
-            f"{where}: timestamps_seconds: {t[:4].tolist()} ({t.size}): "
-            "expected increasing times"
-        )
-    if t[-1] - t[0] > MAX_SPAN_S:
-        raise InputError(
-            f"{where}: timestamps_seconds: {t[-1] - t[0]:g} s: "
-            f"expected at most {MAX_SPAN_S:g} s"
-        )
-    if len(scenario.tracks) * t.size > MAX_STATES:
-        raise InputError(
-            f"{where}: tracks: {len(scenario.tracks)} of {t.size} states: "
+            f"{where}: tracks: {len(tracks)} of {steps} states: "
             f"expected at most {MAX_STATES} states"
         )
-    for track in scenario.tracks:
-        if len(track.states) != t.size:
+    for track in tracks:
+        if len(track.states) != steps:
             raise InputError(
                 f"{where}: track {track.id}: {len(track.states)} states: "
-                f"expected {t.size}, one per timestamp"
+                f"expected {steps}, one per timestamp"
             )
-    rows = columns(
-        (state for track in scenario.tracks for state in track.states), *STATE
-    )
-    table = np.moveaxis(rows.reshape(len(scenario.tracks), t.size, len(STATE)), 2, 0)
+    rows = columns((state for track in tracks for state in track.states), *STATE)
+    table = np.moveaxis(rows.reshape(len(tracks), steps, len(STATE)), 2, 0)
     values = dict(zip(STATE, np.ascontiguousarray(table), strict=True))
     valid = values.pop("valid") != 0.0
     for column in values.values():
@@ -193,86 +188,58 @@ def _states(where: str, scenario: Message) -> _States:
     names = ("center_x", "center_y", "velocity_x", "velocity_y")
     seen = np.stack([values[name][valid] for name in names], axis=1)
     check_coordinates(where, "states", names, seen)
-    return _States(t=t - t[0], values=values, valid=valid)
-
-
-def _rate(where: str, t: np.ndarray) -> float:
-    rate = 1.0 / float(np.median(np.diff(t))) if t.size > 1 else RATE_HZ
-    if abs(rate / RATE_HZ - 1.0) > RATE_TOLERANCE:
-        raise InputError(
-            f"{where}: timestamps_seconds: {rate:g} per second: "
-            f"expected {RATE_HZ:g} (unit s)"
-        )
-    return RATE_HZ
-
-
-def _recorder(scenario: Message) -> int | None:
-    """Number of the recording car's track."""
-    row = scenario.sdc_track_index
-    return row if 0 <= row < len(scenario.tracks) else None
-
-
-def _scenario_notes(scenario: Message, t: np.ndarray) -> Iterator[str]:
-    if (row := _recorder(scenario)) is not None:
-        yield f"the recording car is track {scenario.tracks[row].id}"
-    low, high = WINDOW_S
-    if low < t[-1] < high:
-        yield "9.1 s windows of one drive may share vehicles; training_20s has none"
+    return values, valid
 
 
 def _tracks(
-    where: str, scenario: Message, states: _States, spec: dict
+    where: str,
+    scenario: Message,
+    t: np.ndarray,
+    values: dict[str, np.ndarray],
+    valid: np.ndarray,
+    spec: dict,
 ) -> tuple[tuple[Track, ...], list[str]]:
+    """Tracks, with notes; the parts between long gaps are "id", "id#2", ..."""
     tracks: list[Track] = []
     unset = unseen = 0
-    recorder = _recorder(scenario)
+    recorder = scenario.sdc_track_index
     for row, track in enumerate(scenario.tracks):
-        seen = np.flatnonzero(states.valid[row])
-        if not seen.size:
-            unseen += 1
-        elif TYPES.get(track.object_type) == "unset":
-            unset += 1
-        else:
-            found = _pieces(where, track, states, row, seen, spec)
-            automated = recording_car(spec) if row == recorder else ()
-            tracks += [dataclasses.replace(t, automated=automated) for t in found]
+        seen, kind = np.flatnonzero(valid[row]), TYPES.get(track.object_type)
+        if not seen.size or kind == "unset":
+            unseen += not seen.size
+            unset += bool(seen.size)
+            continue
+        name, own = str(track.id), {key: column[row] for key, column in values.items()}
+        known = kind_of(
+            f"{where}: track {name}",
+            kind or str(track.object_type),
+            section(spec, "kinds"),
+        )
+        cuts = np.flatnonzero(np.diff(seen) > MAX_GAP_STEPS) + 1
+        for part, rows in enumerate(np.split(seen, cuts), start=1):
+            made = Track(
+                id=name if part == 1 else f"{name}#{part}",
+                kind=known,
+                length=_size(own["length"][seen], LENGTH_RANGE_M),
+                width=_size(own["width"][seen], WIDTH_RANGE_M),
+                t=t[rows],
+                x=own["center_x"][rows],
+                y=own["center_y"][rows],
+                heading=own["heading"][rows],
+                speed=np.hypot(own["velocity_x"][rows], own["velocity_y"][rows]),
+                automated=recording_car(spec) if row == recorder else (),
+            )
+            tracks.append(made)
     tracks, doubled = of_one_name(tracks)
     tracks, notes = without_outliers(tracks)
     notes += doubled
-    if unset:
-        notes.append(f"{unset} tracks of unset type left out")
-    if unseen:
-        notes.append(f"{unseen} tracks without a valid state left out")
+    if 0 <= recorder < len(scenario.tracks):
+        car = scenario.tracks[recorder].id
+        notes = [f"the recording car is track {car}", *notes]
+    for count, words in ((unset, "of unset type"), (unseen, "without a valid state")):
+        if count:
+            notes.append(f"{count} tracks {words} left out")
     return tuple(tracks), notes
-
-
-def _pieces(
-    where: str,
-    track: Message,
-    states: _States,
-    row: int,
-    seen: np.ndarray,
-    spec: dict,
-) -> Iterator[Track]:
-    """The parts of a track between long gaps: "id", "id#2", ..."""
-    name, found = str(track.id), TYPES.get(track.object_type, str(track.object_type))
-    known = kind_of(f"{where}: track {name}", found, section(spec, "kinds"))
-    values = {field: column[row] for field, column in states.values.items()}
-    length = _size(values["length"][seen], LENGTH_RANGE_M)
-    width = _size(values["width"][seen], WIDTH_RANGE_M)
-    cuts = np.flatnonzero(np.diff(seen) > MAX_GAP_STEPS) + 1
-    for part, rows in enumerate(np.split(seen, cuts), start=1):
-        yield Track(
-            id=name if part == 1 else f"{name}#{part}",
-            kind=known,
-            length=length,
-            width=width,
-            t=states.t[rows],
-            x=values["center_x"][rows],
-            y=values["center_y"][rows],
-            heading=values["heading"][rows],
-            speed=np.hypot(values["velocity_x"][rows], values["velocity_y"][rows]),
-        )
 
 
 def _size(sizes: np.ndarray, allowed: tuple[float, float]) -> float:
