@@ -2,8 +2,8 @@
 
     python own_planner.py weights.msgpack
 
-Beside this file lie copies of features.py (rcirl_jax/export/own_planner) and of
-reader.py (rcirl_jax/export). The C++ twin, own_planner.cpp, prints the same numbers.
+Beside it: copies of features/columns.py, export/own_planner/features.py and
+export/reader.py of rcirl_jax. The C++ twin, own_planner.cpp, prints the same numbers.
 """
 
 import sys

@@ -1,11 +1,13 @@
-"""One pure function per feature: (frame of one point) -> scalar.
+"""The feature map F, one pure function per feature: (frame of points) -> column.
+
+Runs on numpy and on JAX: `namespace` says whose arrays it was given. It imports numpy
+alone, so that a planner may copy it, with `export/own_planner/features.py`, and compute
+F without JAX.
 
 `COLUMNS` maps the name used in data_specs/features/*.toml to the function that
 computes it. To add a feature: write a function here, name it there. The
 functions are elementwise, so a Frame whose leaves carry further axes gives a
 column with these axes.
-
-Where each obstacle stands relative to one point of a trajectory.
 
 Everything is geometry in the Frenet frame of the scene: the ego's box and the
 obstacles' boxes are axis-aligned there (headings relative to the reference
@@ -24,85 +26,199 @@ Three habits make this fast where it counts, on [T, K] grids of candidates:
 * where the nearest of a class stands is found first, its speed second, by that
   place: carrying both through one pass takes three times the instructions.
 
-The scene's path at given stations, by few gathers.
-
-A table lookup costs a gather of two neighbours, and a CPU pays for every number that
-it gathers. What is read together stands in one of four tables; XLA drops a table that
+A lookup on the path costs a gather of two neighbours, and a CPU pays for every number
+that it gathers. What is read together stands in one table; XLA drops a table that
 nobody reads.
 """
 
+import enum
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
-import flax.struct
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
 
-from rcirl_jax.geometry.frenet import entry, path_curvature
-from rcirl_jax.types import Ego, Kind, Obstacles, Scene, Trajectory
-from rcirl_jax.units import STATION_STEP_M, TIMES_S
+Array = Any  # of numpy, or of JAX
+# of rcirl_jax.types, or plain ones with the same fields
+Scene = Ego = Obstacles = Trajectory = Any
+
+NUM_TIMES = 18  # T
+HORIZON_S = 8.0  # s
+DT_S = HORIZON_S / (NUM_TIMES - 1)  # s, 0.470588
+TIMES_S = np.linspace(0.0, HORIZON_S, NUM_TIMES).astype(np.float32)  # [T] s
+STATION_STEP_M = 2.0  # m between points of the station grid
+
+
+def namespace(*arrays: Array) -> Any:  # noqa: ANN401
+    """Return numpy where all arrays are numpy's, else jax.numpy."""
+    others = (x for x in arrays if not isinstance(x, np.ndarray | np.generic))
+    other = next(others, None)
+    return np if other is None else other.__array_namespace__()
+
+
+class Kind(enum.IntEnum):
+    """What an obstacle is."""
+
+    NONE = 0  # an empty slot
+    VEHICLE = 1
+    CYCLIST = 2
+    PEDESTRIAN = 3
+    STATIC = 4  # a standing object that never moves
+    STOP = 5  # a stop line or a red light; valid only while it demands a stop
+    VIRTUAL = 6  # the destination of the route
+
 
 SLOPE_POINTS = 3  # grid points on each side for dl/ds: 6 m, about a car's length
 
 
-class PathView(flax.struct.PyTreeNode, kw_only=True):
+class PathView(NamedTuple):
     """The path at the stations of one trajectory; all [T]."""
 
-    l: jax.Array  # m, lateral offset of the given path
-    dl: jax.Array  # 1, its slope by station
-    ddl: jax.Array  # 1/m, its second derivative
-    kappa: jax.Array  # 1/m, curvature of the reference line
-    dkappa: jax.Array  # 1/m^2, its slope
-    speed_limit: jax.Array  # m/s
-    road_left: jax.Array  # m, lateral offset of the drivable area's left edge
-    road_right: jax.Array  # m, of its right edge
+    l: Array  # m, lateral offset of the given path
+    dl: Array  # 1, its slope by station
+    ddl: Array  # 1/m, its second derivative
+    kappa: Array  # 1/m, curvature of the reference line
+    dkappa: Array  # 1/m^2, its slope
+    speed_limit: Array  # m/s
+    road_left: Array  # m, lateral offset of the drivable area's left edge
+    road_right: Array  # m, of its right edge
 
-    def curvature(self, trajectory: Trajectory) -> jax.Array:
+    def curvature(self, trajectory: Trajectory) -> Array:
         """Curvature 1/m of the path that the trajectory drives; any equal shape."""
-        at = path_curvature
-        for _ in range(self.kappa.ndim):
-            at = jax.vmap(at)
-        return at(self.kappa, self.dkappa, trajectory.l, trajectory.dl, trajectory.ddl)
+        l, dl, ddl = trajectory.l, trajectory.dl, trajectory.ddl
+        return path_curvature(self.kappa, self.dkappa, l, dl, ddl)
 
 
-def table_slope(table: Float[Array, " p"], points: int) -> Float[Array, " p"]:
-    """Central difference over `points` grid points on each side, by station."""
-    first, last = (jnp.broadcast_to(table[i], (points,)) for i in (0, -1))
-    padded = jnp.concatenate([first, table, last])
+def path_curvature(
+    kappa: Array, dkappa: Array, l: Array, dl: Array, ddl: Array
+) -> Array:
+    """Curvature 1/m of a path given in Frenet coordinates (Werling 2010, app. I).
+
+    tan(d) = dl / (1 - kappa l)
+    kappa_x = [ (ddl + (dkappa l + kappa dl) tan d) cos^2 d / (1 - kappa l)
+                + kappa ] cos d / (1 - kappa l)
+    """
+    xp = namespace(kappa, l)
+    shrink = xp.maximum(1.0 - kappa * l, 0.1)
+    tangent = dl / shrink
+    cosine = 1.0 / xp.sqrt(1.0 + tangent**2)
+    inner = (ddl + (dkappa * l + kappa * dl) * tangent) * cosine**2 / shrink
+    return (inner + kappa) * cosine / shrink
+
+
+def table_slope(table: Array, points: int) -> Array:
+    """Central difference [P] over `points` grid points on each side, by station."""
+    xp = namespace(table)
+    first, last = (xp.broadcast_to(table[i], (points,)) for i in (0, -1))
+    padded = xp.concatenate([first, table, last])
     return (padded[2 * points :] - padded[: -2 * points]) / (
         2.0 * points * STATION_STEP_M
     )
 
 
-def path_view(scene: Scene, s: Float[Array, " t"]) -> PathView:
-    """The path at stations s [T] m; linear between grid points, held at the ends."""
+def path_view(scene: Scene, s: Array) -> PathView:
+    """The path at stations s m; linear between grid points, held at the ends."""
     path = scene.path
+    xp = namespace(s, path.l)
     dl = table_slope(path.l, SLOPE_POINTS)
-    position = jnp.clip(s / STATION_STEP_M, 0.0, path.l.shape[0] - 1.0)
-    low = jnp.minimum(position.astype(jnp.int32), path.l.shape[0] - 2)
-    share = position - low
-    entries = jax.vmap(entry, in_axes=(0, None))
+    position = xp.clip(s / STATION_STEP_M, 0.0, path.l.shape[0] - 1.0)
+    low = xp.minimum(position.astype(xp.int32), path.l.shape[0] - 2)
+    share = position - low.astype(xp.float32)
 
-    def at(*columns: jax.Array) -> jax.Array:
-        table = jnp.stack(columns)
-        rise = jnp.pad(table[:, 1:] - table[:, :-1], ((0, 0), (0, 1)))
-        start, slope = jnp.split(entries(jnp.concatenate([table, rise]), low), 2)
+    def at(*columns: Array) -> Array:
+        table = xp.stack(columns)
+        rise = xp.pad(table[:, 1:] - table[:, :-1], ((0, 0), (0, 1)))
+        table = xp.concatenate([table, rise])
+        if xp is np:
+            start, slope = np.split(np.take(table, low, axis=1), 2)
+        else:  # plain indexing masks what lies outside, as slow as the gather
+            found = table.at[:, low].get(mode="promise_in_bounds")
+            start, slope = xp.split(found, 2)
         return start + share * slope
 
     l, dl_at, ddl = at(path.l, dl, table_slope(dl, SLOPE_POINTS))
     kappa, dkappa = at(path.kappa, table_slope(path.kappa, 1))
     (limit,) = at(path.speed_limit)
     road_left, road_right = at(path.road_left, path.road_right)
-    return PathView(
-        l=l,
-        dl=dl_at,
-        ddl=ddl,
-        kappa=kappa,
-        dkappa=dkappa,
-        speed_limit=limit,
-        road_left=road_left,
-        road_right=road_right,
+    return PathView(l, dl_at, ddl, kappa, dkappa, limit, road_left, road_right)
+
+
+FIRST = np.arange(NUM_TIMES) == 0  # [T]
+MIN_ADVANCE_M = 1.0  # m between neighbours below which dl/ds is taken as 0
+
+
+def differentiate(
+    s: Array, v0: Array, a0: Array, time_valid: Array
+) -> tuple[Array, Array, Array]:
+    """Return speed, acceleration and jerk of stations on the time axis.
+
+        v_i = (s_{i+1} - s_{i-1}) / 2dt        v_0, a_0 given (the ego's state)
+        a_i = (s_{i+1} - 2 s_i + s_{i-1}) / dt^2
+        j_i = (a_i - a_{i-1}) / dt             j_0 = j_1
+
+    At the last valid time there is no next point: a is carried over and v
+    follows from it. Because the mask is shared by all trajectories of a scene,
+    the operator is the same for all of them.
+
+    Args:
+      s: [..., T] m.
+      v0: m/s at t = 0.
+      a0: m/s^2 at t = 0.
+      time_valid: [T] bool, a prefix of True with at least 3 entries.
+
+    Returns:
+      v m/s, a m/s^2, j m/s^3, all [..., T]. Beyond the last valid time they are
+      finite and meaningless.
+    """
+    xp = namespace(s, time_valid)
+    behind, ahead = _neighbours(s)
+    has_next = xp.concatenate([time_valid[1:], xp.zeros_like(time_valid[:1])])
+    central_a = xp.where(FIRST, a0, (ahead - 2.0 * s + behind) / DT_S**2)
+    carried_a, _ = _neighbours(central_a)
+    a = xp.where(has_next, central_a, carried_a)
+    v = xp.where(
+        has_next, (ahead - behind) / (2.0 * DT_S), (s - behind) / DT_S + 0.5 * a * DT_S
     )
+    v = xp.where(FIRST, v0, v)
+    step = (a[..., 1:] - a[..., :-1]) / DT_S
+    return v, a, xp.concatenate([step[..., :1], step], axis=-1)
+
+
+def lateral_derivatives(
+    s: Array, l: Array, dl0: Array, ddl0: Array
+) -> tuple[Array, Array]:
+    """Return dl/ds and d2l/ds2 by divided differences over the neighbouring times.
+
+    Where the car advances less than `MIN_ADVANCE_M` between the neighbours the
+    derivative by station is not defined by positions and is set to 0.
+
+    Args:
+      s: [..., T] m.
+      l: [..., T] m.
+      dl0: dl/ds at t = 0.
+      ddl0: 1/m, at t = 0.
+
+    Returns:
+      dl (1) and ddl (1/m), [..., T].
+    """
+    xp = namespace(s, l)
+    advance = _spread(s)
+    moves = advance > MIN_ADVANCE_M
+    safe = xp.where(moves, advance, 1.0)
+    dl = xp.where(FIRST, dl0, xp.where(moves, _spread(l) / safe, 0.0))
+    ddl = xp.where(FIRST, ddl0, xp.where(moves, _spread(dl) / safe, 0.0))
+    return dl, ddl
+
+
+def _neighbours(x: Array) -> tuple[Array, Array]:
+    """x_{i-1} and x_{i+1}; at the ends the end itself."""
+    padded = namespace(x).concatenate([x[..., :1], x, x[..., -1:]], axis=-1)
+    return padded[..., :-2], padded[..., 2:]
+
+
+def _spread(x: Array) -> Array:
+    """x_{i+1} - x_{i-1}, one-sided at both ends."""
+    behind, ahead = _neighbours(x)
+    return ahead - behind
 
 
 LATERAL_BUFFER_M = 0.2  # m added to the half widths; half of Apollo's 0.4 m
@@ -113,14 +229,14 @@ LATERAL_CAP_M = 10.0  # m, Apollo: lateral "none" distance
 FAR_M = 1e6  # m, "no such obstacle"
 
 
-class Nearest(flax.struct.PyTreeNode, kw_only=True):
+class Nearest(NamedTuple):
     """The nearest member of a class; (cap, 0) where none is nearer than the cap."""
 
-    distance: jax.Array  # m, in [0, cap]
-    speed: jax.Array  # m/s, obstacle minus ego
+    distance: Array  # m, in [0, cap]
+    speed: Array  # m/s, obstacle minus ego
 
 
-class Relations(flax.struct.PyTreeNode, kw_only=True):
+class Relations(NamedTuple):
     """One point against all obstacles; all scalars."""
 
     follow: Nearest  # in the way and ahead
@@ -130,25 +246,26 @@ class Relations(flax.struct.PyTreeNode, kw_only=True):
     sidepass_rear: Nearest  # beside, behind
     stop: Nearest  # a line ahead that demands a stop
     virtual: Nearest  # the destination ahead
-    body: jax.Array  # m, signed distance to the closest body; < 0 penetration
-    line_overrun: jax.Array  # m, how far a demanding line was just crossed
+    body: Array  # m, signed distance to the closest body; < 0 penetration
+    line_overrun: Array  # m, how far a demanding line was just crossed
 
 
-class Slot(flax.struct.PyTreeNode, kw_only=True):
+class Slot(NamedTuple):
     """One obstacle at one time, grown by the ego's half extents; scalars."""
 
-    lower: jax.Array  # m, the ego's centre is behind it below; FAR_M: no body
-    upper: jax.Array  # m, and past it above; -FAR_M: no body
-    right: jax.Array  # m, the ego's side clears it on the right below
-    left: jax.Array  # m, and on the left above
-    speed: jax.Array  # m/s along the road
-    wall: jax.Array  # m, the same for a line that demands a stop; FAR_M: none
-    wall_before: jax.Array  # m, a time earlier; -FAR_M: did not demand one
-    end: jax.Array  # m, the same for the destination; FAR_M: none
+    lower: Array  # m, the ego's centre is behind it below; FAR_M: no body
+    upper: Array  # m, and past it above; -FAR_M: no body
+    right: Array  # m, the ego's side clears it on the right below
+    left: Array  # m, and on the left above
+    speed: Array  # m/s along the road
+    wall: Array  # m, the same for a line that demands a stop; FAR_M: none
+    wall_before: Array  # m, a time earlier; -FAR_M: did not demand one
+    end: Array  # m, the same for the destination; FAR_M: none
 
 
 def slots(ego: Ego, obstacles: Obstacles) -> tuple[Slot, ...]:
     """The N obstacles as Slots with leaves [T]."""
+    xp = namespace(obstacles.s_lower)
     half_length, half_width = 0.5 * ego.length, 0.5 * ego.width
     kind = obstacles.kind[:, None]
     body = obstacles.valid & (kind >= Kind.VEHICLE) & (kind <= Kind.STATIC)
@@ -158,20 +275,20 @@ def slots(ego: Ego, obstacles: Obstacles) -> tuple[Slot, ...]:
     upper, left = obstacles.s_upper + half_length, obstacles.l_upper + half_width
     # a body that lacks a number has no place: the distance to bodies is NaN then
     numbers = lower + upper + obstacles.l_lower + left + obstacles.speed
-    lacking = body & ~jnp.isfinite(numbers)
-    demanded = jnp.where(line, lower, -FAR_M)
-    before = jnp.concatenate(
-        [jnp.where(line[:, :1], FAR_M, -FAR_M), demanded[:, :-1]], axis=1
+    lacking = body & ~xp.isfinite(numbers)
+    demanded = xp.where(line, lower, -FAR_M)
+    before = xp.concatenate(
+        [xp.where(line[:, :1], FAR_M, -FAR_M), demanded[:, :-1]], axis=1
     )
     leaves = (
-        jnp.where(body, lower, FAR_M),
-        jnp.where(body, jnp.where(lacking, jnp.nan, upper), -FAR_M),
+        xp.where(body, lower, FAR_M),
+        xp.where(body, xp.where(lacking, xp.nan, upper), -FAR_M),
         obstacles.l_lower - half_width,
-        jnp.where(lacking, jnp.nan, left),
+        xp.where(lacking, xp.nan, left),
         obstacles.speed,
-        jnp.where(line, lower, FAR_M),
+        xp.where(line, lower, FAR_M),
         before,
-        jnp.where(end, lower, FAR_M),
+        xp.where(end, lower, FAR_M),
     )
     names = ("lower", "upper", "right", "left", "speed", "wall", "wall_before", "end")
     return tuple(
@@ -192,19 +309,19 @@ CAPS_M = {
 }
 
 
-def _larger(a: jax.Array | float, b: jax.Array) -> jax.Array:
-    """One instruction where `jnp.maximum` takes four; NaN where b is."""
-    return jnp.where(a > b, a, b)
+def _larger(a: Array | float, b: Array) -> Array:
+    """One instruction where `xp.maximum` takes four; NaN where b is."""
+    return namespace(b).where(a > b, a, b)
 
 
-def _gaps(o: Slot, s: jax.Array, l: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _gaps(o: Slot, s: Array, l: Array) -> tuple[Array, Array]:
     """(gap, lateral gap) m; negative where they overlap."""
     return _larger(o.lower - s, s - o.upper), _larger(o.right - l, l - o.left)
 
 
 def _memberships(
-    o: Slot, s: jax.Array, gap: jax.Array, aside: jax.Array
-) -> dict[str, tuple[jax.Array, jax.Array]]:
+    o: Slot, s: Array, gap: Array, aside: Array
+) -> dict[str, tuple[Array, Array]]:
     """Of each class: whether the obstacle is a member, and what orders members.
 
     Ordering by an edge's station orders by the distance to it.
@@ -225,40 +342,41 @@ def _memberships(
 
 def _nearest(
     ego_slots: tuple[Slot, ...],
-    met: list[dict[str, tuple[jax.Array, jax.Array]]],
-    s: jax.Array,
-    v: jax.Array,
+    met: list[dict[str, tuple[Array, Array]]],
+    s: Array,
+    v: Array,
 ) -> dict[str, Nearest]:
     """The nearest of each class; of two at the very same place the slower."""
-    from_ego = {"overtake": -s, "sidepass_rear": -s, "nudge": jnp.zeros_like(s)}
+    xp = namespace(s)
+    from_ego = {"overtake": -s, "sidepass_rear": -s, "nudge": xp.zeros_like(s)}
     found = {}
     for name, cap in CAPS_M.items():
-        edge = speed = jnp.asarray(FAR_M)
+        edge = speed = xp.full_like(s, FAR_M)
         for classes in met:
             member, key = classes[name]
-            key = jnp.where(member, key, FAR_M)
-            edge = jnp.where(edge < key, edge, key)  # no member's is NaN
+            key = xp.where(member, key, FAR_M)
+            edge = xp.where(edge < key, edge, key)  # no member's is NaN
         for o, classes in zip(ego_slots, met, strict=True):
             member, key = classes[name]
             slower = member & (key == edge) & (o.speed < speed)
-            speed = jnp.where(slower, o.speed, speed)
+            speed = xp.where(slower, o.speed, speed)
         distance = edge - from_ego.get(name, s)
         known = distance < cap
         # none is found where compiled code rounds a key differently in each loop
         unknown = ~known | (speed >= FAR_M)
         found[name] = Nearest(
-            distance=jnp.where(known, distance, cap),
-            speed=jnp.where(unknown, 0.0, speed - v),
+            distance=xp.where(known, distance, cap),
+            speed=xp.where(unknown, 0.0, speed - v),
         )
     return found
 
 
 def relate(
     ego_slots: tuple[Slot, ...],
-    s: jax.Array,
-    l: jax.Array,
-    v: jax.Array,
-    s_before: jax.Array,
+    s: Array,
+    l: Array,
+    v: Array,
+    s_before: Array,
 ) -> Relations:
     """Classify every obstacle against the ego at (s, l) with speed v.
 
@@ -281,21 +399,22 @@ def relate(
       v: m/s, its speed.
       s_before: m, its station one time earlier; very negative at the first.
     """
-    signed, overrun = jnp.asarray(FAR_M**2), jnp.zeros(())
+    xp = namespace(s)
+    signed, overrun = xp.full_like(s, FAR_M**2), xp.zeros_like(s)
     met = []
     for o in ego_slots:
         gap, aside = _gaps(o, s, l)
         met.append(_memberships(o, s, gap, aside))
         square = _larger(0.0, gap) ** 2 + _larger(0.0, aside) ** 2
-        depth = jnp.maximum(gap, aside)
+        depth = xp.maximum(gap, aside)
         # NaN of one body stays: a comparison would forget it at the next
-        signed = jnp.minimum(signed, jnp.where(depth < 0.0, depth, square))
+        signed = xp.minimum(signed, xp.where(depth < 0.0, depth, square))
         crossed = (s > o.wall) & (s_before <= o.wall_before)
-        overrun = jnp.where(crossed, jnp.maximum(overrun, s - o.wall), overrun)
-    outside = jnp.sqrt(jnp.where(signed > 0.0, signed, 1.0))
+        overrun = xp.where(crossed, xp.maximum(overrun, s - o.wall), overrun)
+    outside = xp.sqrt(xp.where(signed > 0.0, signed, 1.0))
     return Relations(
         **_nearest(ego_slots, met, s, v),
-        body=jnp.where(signed > 0.0, outside, signed),
+        body=xp.where(signed > 0.0, outside, signed),
         line_overrun=overrun,
     )
 
@@ -304,89 +423,46 @@ MIN_COLLISION_M = -10.0  # m, deepest penetration told apart
 BEFORE_M = 1e6  # m, how far back the ego is taken to be before the first time
 
 
-class Frame(flax.struct.PyTreeNode, kw_only=True):
+class Frame(NamedTuple):
     """What the columns read at one point; all leaves scalars."""
 
-    time: jax.Array  # s
-    advance: jax.Array  # m, station since t = 0
+    time: Array  # s
+    advance: Array  # m, station since t = 0
     point: Trajectory  # leaves [] instead of [T]
     relations: Relations
     path: PathView
-    kappa: jax.Array  # 1/m, curvature of the path driven
+    kappa: Array  # 1/m, curvature of the path driven
 
 
-def make_frame(scene: Scene, trajectory: Trajectory) -> Frame:
-    """The frames of one trajectory; every leaf is [T]."""
-    view = path_view(scene, trajectory.s)
-    points = jax.tree.map(lambda x: x[:, None], (trajectory, view))
-    frame = _grid(scene, *points)
-    return jax.tree.map(lambda x: x[:, 0], frame)
-
-
-def candidate_frames(scene: Scene, trajectories: Trajectory) -> Frame:
-    """The frames of K trajectories [K, T] of a scene; every leaf is [T, K].
-
-    Candidates run along the last axis, so that XLA's loops are long and all
-    lanes of the processor's vectors are filled.
-    """
-    view = jax.vmap(path_view, in_axes=(None, 0))(scene, trajectories.s)
-    leaves, tree = jax.tree.flatten((trajectories, view))
-    points = jnp.stack(leaves).swapaxes(1, 2)  # one copy instead of one a leaf
-    return _grid(scene, *jax.tree.unflatten(tree, points))
-
-
-def _grid(scene: Scene, trajectory: Trajectory, view: PathView) -> Frame:
-    """Frames of a [T, K] grid of points; the one place that maps over points."""
-    s = trajectory.s
-    before = jnp.concatenate([jnp.full_like(s[:1], -BEFORE_M), s[:-1]])
-    kappa = view.curvature(trajectory)
-
-    def row(time: jax.Array, obstacles: tuple, s: jax.Array, *rest: jax.Array) -> tuple:
-        one = jax.vmap(relate, in_axes=(None, 0, 0, 0, 0))
-        return jnp.broadcast_to(time, s.shape), one(obstacles, s, *rest)
-
-    everyone = slots(scene.ego, scene.obstacles)
-    time, relations = jax.vmap(row)(
-        jnp.asarray(TIMES_S), everyone, s, trajectory.l, trajectory.v, before
-    )
-    return Frame(
-        time=time,
-        advance=s - scene.ego.s,
-        point=trajectory,
-        relations=relations,
-        path=view,
-        kappa=kappa,
-    )
-
-
-def driven_curvature(scene: Scene, trajectory: Trajectory) -> jax.Array:
+def driven_curvature(scene: Scene, trajectory: Trajectory) -> Array:
     """Curvature [T] 1/m of the path driven: reference line plus lateral motion."""
     return path_view(scene, trajectory.s).curvature(trajectory)
 
 
-def _collision_distance(frame: Frame) -> jax.Array:
+def _collision_distance(frame: Frame) -> Array:
     overrun, signed = frame.relations.line_overrun, frame.relations.body
-    signed = jnp.where(overrun > 0.0, jnp.minimum(signed, -overrun), signed)
-    return jnp.clip(signed, MIN_COLLISION_M, OBSTACLE_CAP_M)
+    xp = namespace(signed)
+    signed = xp.where(overrun > 0.0, xp.minimum(signed, -overrun), signed)
+    return xp.clip(signed, MIN_COLLISION_M, OBSTACLE_CAP_M)
 
 
-def _of_nearest(name: str, attribute: str) -> Callable[[Frame], jax.Array]:
+def _of_nearest(name: str, attribute: str) -> Callable[[Frame], Array]:
     """Distance or relative speed of the nearest of a class."""
 
-    def column(frame: Frame) -> jax.Array:
+    def column(frame: Frame) -> Array:
         nearest: Nearest = getattr(frame.relations, name)
         return getattr(nearest, attribute)
 
     return column
 
 
-def _nudge_distance(frame: Frame) -> jax.Array:
+def _nudge_distance(frame: Frame) -> Array:
     """Along the road: 0 while something is abreast, the cap otherwise."""
     abreast = frame.relations.nudge.distance < LATERAL_CAP_M
-    return jnp.where(abreast, 0.0, LINE_CAP_M)
+    return namespace(abreast).where(abreast, 0.0, LINE_CAP_M)
 
 
-COLUMNS: dict[str, Callable[[Frame], jax.Array]] = {
+COLUMNS: dict[str, Callable[[Frame], Array]] = {
     "l": lambda frame: frame.point.l,
     "dl": lambda frame: frame.point.dl,
     "ddl": lambda frame: frame.point.ddl,
@@ -399,7 +475,7 @@ COLUMNS: dict[str, Callable[[Frame], jax.Array]] = {
     "jerk": lambda frame: frame.point.j,
     "lateral_acceleration": lambda frame: frame.point.v**2 * frame.kappa,
     "collision_distance": _collision_distance,
-    "collision": lambda frame: (_collision_distance(frame) < 0.0).astype(jnp.float32),
+    "collision": lambda frame: (_collision_distance(frame) < 0.0).astype("float32"),
     "follow_distance": _of_nearest("follow", "distance"),
     "follow_speed": _of_nearest("follow", "speed"),
     "overtake_distance": _of_nearest("overtake", "distance"),

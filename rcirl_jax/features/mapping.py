@@ -16,14 +16,62 @@ from jaxtyping import Array, Float
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.features.columns import (
+    BEFORE_M,
     COLUMNS,
     OF_CANDIDATE_AT_START,
     Frame,
-    candidate_frames,
-    make_frame,
+    PathView,
+    path_view,
+    relate,
+    slots,
 )
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Candidates, Scene, Trajectory
+from rcirl_jax.units import TIMES_S
+
+
+def make_frame(scene: Scene, trajectory: Trajectory) -> Frame:
+    """The frames of one trajectory; every leaf is [T]."""
+    view = path_view(scene, trajectory.s)
+    points = jax.tree.map(lambda x: x[:, None], (trajectory, view))
+    frame = _grid(scene, *points)
+    return jax.tree.map(lambda x: x[:, 0], frame)
+
+
+def candidate_frames(scene: Scene, trajectories: Trajectory) -> Frame:
+    """The frames of K trajectories [K, T] of a scene; every leaf is [T, K].
+
+    Candidates run along the last axis, so that XLA's loops are long and all
+    lanes of the processor's vectors are filled.
+    """
+    view = jax.vmap(path_view, in_axes=(None, 0))(scene, trajectories.s)
+    leaves, tree = jax.tree.flatten((trajectories, view))
+    points = jnp.stack(leaves).swapaxes(1, 2)  # one copy instead of one a leaf
+    return _grid(scene, *jax.tree.unflatten(tree, points))
+
+
+def _grid(scene: Scene, trajectory: Trajectory, view: PathView) -> Frame:
+    """Frames of a [T, K] grid of points; the one place that maps over points."""
+    s = trajectory.s
+    before = jnp.concatenate([jnp.full_like(s[:1], -BEFORE_M), s[:-1]])
+    kappa = view.curvature(trajectory)
+
+    def row(time: jax.Array, obstacles: tuple, s: jax.Array, *rest: jax.Array) -> tuple:
+        one = jax.vmap(relate, in_axes=(None, 0, 0, 0, 0))
+        return jnp.broadcast_to(time, s.shape), one(obstacles, s, *rest)
+
+    everyone = slots(scene.ego, scene.obstacles)
+    time, relations = jax.vmap(row)(
+        jnp.asarray(TIMES_S), everyone, s, trajectory.l, trajectory.v, before
+    )
+    return Frame(
+        time=time,
+        advance=s - scene.ego.s,
+        point=trajectory,
+        relations=relations,
+        path=view,
+        kappa=kappa,
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

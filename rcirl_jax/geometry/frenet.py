@@ -161,23 +161,3 @@ def project_points(
 
 # as `_project`, for lanes: lines [B, M], x, y and near [B, q]
 project_lanes = jax.jit(jax.vmap(_project))
-
-
-def path_curvature(
-    kappa: Float[Array, ""],
-    dkappa: Float[Array, ""],
-    l: Float[Array, ""],
-    dl: Float[Array, ""],
-    ddl: Float[Array, ""],
-) -> Float[Array, ""]:
-    """Curvature 1/m of a path given in Frenet coordinates (Werling 2010, app. I).
-
-    tan(d) = dl / (1 - kappa l)
-    kappa_x = [ (ddl + (dkappa l + kappa dl) tan d) cos^2 d / (1 - kappa l)
-                + kappa ] cos d / (1 - kappa l)
-    """
-    shrink = jnp.maximum(1.0 - kappa * l, 0.1)
-    tangent = dl / shrink
-    cosine = 1.0 / jnp.sqrt(1.0 + tangent**2)
-    inner = (ddl + (dkappa * l + kappa * dl) * tangent) * cosine**2 / shrink
-    return (inner + kappa) * cosine / shrink

@@ -20,9 +20,8 @@ from rcirl_jax.features.columns import (
     COLUMNS,
     LINE_CAP_M,
     Frame,
-    candidate_frames,
-    make_frame,
 )
+from rcirl_jax.features.mapping import candidate_frames, make_frame
 from rcirl_jax.types import Scene, Trajectory
 from rcirl_jax.units import DT_S, TIMES_S
 

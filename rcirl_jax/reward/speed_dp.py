@@ -18,7 +18,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from rcirl_jax.features.columns import COLUMNS, make_frame
+from rcirl_jax.features.columns import COLUMNS
+from rcirl_jax.features.mapping import make_frame
 from rcirl_jax.types import Scene, Trajectory
 from rcirl_jax.units import DT_S
 

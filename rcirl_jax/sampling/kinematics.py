@@ -8,94 +8,17 @@ and leaves with derivatives made here.
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from rcirl_jax.features.columns import path_view
+from rcirl_jax.features.columns import (
+    FIRST,
+    differentiate,
+    lateral_derivatives,
+    path_view,
+)
 from rcirl_jax.types import Scene, Trajectory
-from rcirl_jax.units import DT_S, NUM_TIMES
 
-FIRST = np.arange(NUM_TIMES) == 0  # [T]
 LONG_AXIS, BLOCK = 32, 8  # points beyond which a running extremum works in blocks
-MIN_ADVANCE_M = 1.0  # m between neighbours below which dl/ds is taken as 0
-
-
-def differentiate(
-    s: Float[Array, " t"],
-    v0: Float[Array, ""],
-    a0: Float[Array, ""],
-    time_valid: Bool[Array, " t"],
-) -> tuple[Float[Array, " t"], Float[Array, " t"], Float[Array, " t"]]:
-    """Speed, acceleration and jerk of stations on the time axis.
-
-        v_i = (s_{i+1} - s_{i-1}) / 2dt        v_0, a_0 given (the ego's state)
-        a_i = (s_{i+1} - 2 s_i + s_{i-1}) / dt^2
-        j_i = (a_i - a_{i-1}) / dt             j_0 = j_1
-
-    At the last valid time there is no next point: a is carried over and v
-    follows from it. Because the mask is shared by all trajectories of a scene,
-    the operator is the same for all of them.
-
-    Args:
-      s: [T] m.
-      v0: m/s at t = 0.
-      a0: m/s^2 at t = 0.
-      time_valid: [T] bool, a prefix of True with at least 3 entries.
-
-    Returns:
-      v [T] m/s, a [T] m/s^2, j [T] m/s^3. Beyond the last valid time they are
-      finite and meaningless.
-    """
-    behind, ahead = _neighbours(s)
-    has_next = jnp.concatenate([time_valid[1:], jnp.zeros_like(time_valid[:1])])
-    central_a = jnp.where(FIRST, a0, (ahead - 2.0 * s + behind) / DT_S**2)
-    carried_a, _ = _neighbours(central_a)
-    a = jnp.where(has_next, central_a, carried_a)
-    v = jnp.where(
-        has_next, (ahead - behind) / (2.0 * DT_S), (s - behind) / DT_S + 0.5 * a * DT_S
-    )
-    v = jnp.where(FIRST, v0, v)
-    step = (a[1:] - a[:-1]) / DT_S
-    return v, a, jnp.concatenate([step[:1], step])
-
-
-def lateral_derivatives(
-    s: Float[Array, " t"],
-    l: Float[Array, " t"],
-    dl0: Float[Array, ""],
-    ddl0: Float[Array, ""],
-) -> tuple[Float[Array, " t"], Float[Array, " t"]]:
-    """dl/ds and d2l/ds2 by divided differences over the neighbouring times.
-
-    Where the car advances less than `MIN_ADVANCE_M` between the neighbours the
-    derivative by station is not defined by positions and is set to 0.
-
-    Args:
-      s: [T] m.
-      l: [T] m.
-      dl0: dl/ds at t = 0.
-      ddl0: 1/m, at t = 0.
-
-    Returns:
-      dl [T] (1) and ddl [T] (1/m).
-    """
-    advance = _spread(s)
-    moves = advance > MIN_ADVANCE_M
-    safe = jnp.where(moves, advance, 1.0)
-    dl = jnp.where(FIRST, dl0, jnp.where(moves, _spread(l) / safe, 0.0))
-    ddl = jnp.where(FIRST, ddl0, jnp.where(moves, _spread(dl) / safe, 0.0))
-    return dl, ddl
-
-
-def _neighbours(x: Float[Array, " t"]) -> tuple[Float[Array, " t"], Float[Array, " t"]]:
-    """x_{i-1} and x_{i+1}; at the ends the end itself."""
-    padded = jnp.concatenate([x[:1], x, x[-1:]])
-    return padded[:-2], padded[2:]
-
-
-def _spread(x: Float[Array, " t"]) -> Float[Array, " t"]:
-    """x_{i+1} - x_{i-1}, one-sided at both ends."""
-    behind, ahead = _neighbours(x)
-    return ahead - behind
 
 
 def trajectory_from_positions(

@@ -36,8 +36,9 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from rcirl_jax.features.columns import path_curvature
 from rcirl_jax.geometry.boxes import Box, contact_interval, frenet_extent, separation
-from rcirl_jax.geometry.frenet import lookup, path_curvature
+from rcirl_jax.geometry.frenet import lookup
 from rcirl_jax.geometry.limits import planning_limit
 from rcirl_jax.planner.plan import either
 from rcirl_jax.planner.prediction import Bodies, obstacles_of
@@ -119,7 +120,7 @@ def path_points(
     slope = (ahead - behind) / (2.0 * step)
     bend = (ahead - 2.0 * here + behind) / step**2
     dkappa = (kappas[2] - kappas[0]) / (2.0 * step)
-    curvature = jax.vmap(path_curvature)(kappas[1], dkappa, here, slope, bend)
+    curvature = path_curvature(kappas[1], dkappa, here, slope, bend)
     return here, slope, curvature, kappas[1]
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.data.store.rows import check_some, refuse_scenes
 from rcirl_jax.features import FeatureMap, feature_map
-from rcirl_jax.features.columns import Frame, candidate_frames
+from rcirl_jax.features.columns import Frame
+from rcirl_jax.features.mapping import candidate_frames
 from rcirl_jax.planner.prediction import select_future, with_predicted_futures
 from rcirl_jax.planner.safety import check
 from rcirl_jax.reward import CandidateInfo

@@ -17,7 +17,8 @@ from rcirl_jax.export.own_planner.features import (
     Path,
     Scene,
 )
-from rcirl_jax.features.columns import COLUMNS
+from rcirl_jax.features import columns as f
+from tests.conftest import REPO
 from tests.helpers.own_planner import every_column
 
 FLAT = np.zeros(128)
@@ -50,9 +51,8 @@ def columns():
 
 
 def test_it_has_the_columns_of_the_package():
-    assert set(features.COLUMNS) == set(COLUMNS)
-    units = {spec.name: spec.unit for spec in every_column().specs}
-    assert {name: unit for name, (unit, _) in features.COLUMNS.items()} == units
+    assert set(features.UNITS) == set(f.COLUMNS)
+    assert {spec.name: spec.unit for spec in every_column().specs} == features.UNITS
 
 
 GAP = np.where(np.arange(18) == 3, np.nan, 1.0)
@@ -122,11 +122,18 @@ def test_unknown_columns_and_other_units_are_refused():
         FeatureMap(["l"], [])
 
 
-def test_the_file_alone_needs_numpy_only(tmp_path):
-    copied = tmp_path / "features.py"
-    shutil.copy(features.__file__, copied)
+@pytest.mark.parametrize("copied", [True, False])
+def test_jax_is_not_loaded(tmp_path, copied):
+    if copied:
+        for module in (features, f):
+            shutil.copy(module.__file__, tmp_path)
+    block, name = "", features.__name__
+    if copied:
+        block, name = "sys.modules['rcirl_jax'] = None; ", "features"
     script = (
-        "import sys, features; loaded = {m.split('.')[0] for m in sys.modules}; "
-        "assert not loaded & {'jax', 'rcirl_jax', 'msgpack'}, loaded"
+        f"import sys; {block}import {name}; "
+        "loaded = {m.split('.')[0] for m in sys.modules}; "
+        "assert not loaded & {'jax', 'flax', 'scipy'}, loaded"
     )
-    subprocess.run([sys.executable, "-c", script], cwd=tmp_path, check=True)
+    where = tmp_path if copied else REPO
+    subprocess.run([sys.executable, "-c", script], cwd=where, check=True)

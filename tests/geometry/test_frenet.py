@@ -8,11 +8,11 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rcirl_jax.features.columns import path_curvature
 from rcirl_jax.geometry.frenet import (
     _curve,
     _from_nearest,
     lookup,
-    path_curvature,
     project_points,
     reference_line_from_polyline,
 )

@@ -1,11 +1,11 @@
 """The conformance cases: they are what JAX says, and the checker finds what differs."""
 
 import hashlib
+import importlib
 import json
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ from onboard.conformance import check, make
 from rcirl_jax.export import load_weights
 from rcirl_jax.export.own_planner import features
 from rcirl_jax.export.own_planner.plain import plain_scene
+from rcirl_jax.features import columns as f
 from rcirl_jax.units import NUM_TIMES
 from tests.helpers.own_planner import TOLERANCE, entries, error, numpy_answers
 from tests.onboard.programs import ONBOARD
@@ -106,42 +107,51 @@ def test_features_alone_can_be_checked(cases, tmp_path):
     assert lines[0].startswith("free_road: 1134 numbers: expected 1137")
 
 
-# what stands in the numpy file, the mistake instead, and the columns of the case
-# "follow" that are wrong then
+# a file of F for planners, what stands there, the mistake instead, and the columns of
+# the case "follow" that are wrong then
 FAULTS = {
-    "none": ("", "", ()),
+    "none": (features, "", "", ()),
     "one_row_late": (
+        features,
         '_numbers(f"{field}.{name}", given, (NUM_TIMES,))',
         'np.roll(_numbers(f"{field}.{name}", given, (NUM_TIMES,)), 1)',
         ("collision_distance", "follow_distance"),
     ),
     "sign_of_relative_speed": (
-        "np.where(known, self.speed - v, ",
-        "np.where(known, v - self.speed, ",
+        f,
+        "xp.where(unknown, 0.0, speed - v)",
+        "xp.where(unknown, 0.0, v - speed)",
         ("follow_speed",),
     ),
     "kilometres_an_hour": (
-        '("m/s", lambda frame: frame.x.v)',
-        '("m/s", lambda frame: 3.6 * frame.x.v)',
+        f,
+        '"velocity": lambda frame: frame.point.v',
+        '"velocity": lambda frame: 3.6 * frame.point.v',
         ("velocity",),
     ),
 }
 
 
-def numpy_file(old, new, monkeypatch):
-    """The numpy file as a module, with one text replaced."""
-    text = Path(features.__file__).read_text()
-    assert not old or text.count(old) == 1
-    module = ModuleType("numpy_file")
-    monkeypatch.setitem(sys.modules, module.__name__, module)
-    exec(text.replace(old, new) if old else text, vars(module))
-    return module
+def numpy_files(module, old, new, folder, monkeypatch):
+    """The two files as a planner copies them, with one text of one replaced."""
+    for file in (f, features):
+        text = Path(file.__file__).read_text()
+        if file is module and old:
+            assert text.count(old) == 1
+            text = text.replace(old, new)
+        (folder / Path(file.__file__).name).write_text(text)
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setitem(sys.modules, "rcirl_jax.features", None)
+    for name in ("features", "columns"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    return importlib.import_module("features")
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_planted_faults_are_found(cases, tmp_path, monkeypatch, fault):
-    old, new, columns = FAULTS[fault]
-    module, given = numpy_file(old, new, monkeypatch), scenes()
+    *planted, columns = FAULTS[fault]
+    given = scenes()
+    module = numpy_files(*planted, tmp_path, monkeypatch)
 
     def of_the_module(name, _):
         reward = load_weights(ONBOARD / "conformance" / cases[name].weights)

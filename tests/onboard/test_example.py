@@ -14,6 +14,7 @@ from rcirl_jax import Body, Car, CentreLine, load_weights, scene_from
 from rcirl_jax.export import reader
 from rcirl_jax.export.own_planner import features
 from rcirl_jax.export.own_planner.plain import plain_scene
+from rcirl_jax.features import columns
 from tests.export.test_weights import golden
 from tests.helpers.own_planner import TOLERANCE, error, numpy_answers
 from tests.onboard.programs import ONBOARD, built, run
@@ -23,10 +24,10 @@ WEIGHTS = sorted((ONBOARD / "conformance").glob("*.msgpack"))
 
 @pytest.fixture(scope="module")
 def stranger(tmp_path_factory):
-    """A folder with the two files and the program, and where only two packages are."""
+    """A folder with the files and the program, and where only two packages are."""
     folder, packages = (tmp_path_factory.mktemp(name) for name in ("own", "packages"))
     program = ONBOARD / "example" / "own_planner.py"
-    for file in (features.__file__, reader.__file__, program):
+    for file in (features.__file__, columns.__file__, reader.__file__, program):
         shutil.copy(file, folder)
     for package in (np, msgpack):
         place = Path(package.__file__).parent

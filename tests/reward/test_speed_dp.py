@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.features.columns import COLUMNS, make_frame
+from rcirl_jax.features.columns import COLUMNS
+from rcirl_jax.features.mapping import make_frame
 from rcirl_jax.reward import SpeedDpCost, speed_dp_cost
 from rcirl_jax.sampling import trajectory_from_positions
 from rcirl_jax.units import DT_S, TIMES_S

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rcirl_jax.features.columns import differentiate
 from rcirl_jax.sampling import trajectory_from_positions, trajectory_on_path
-from rcirl_jax.sampling.kinematics import differentiate
 from rcirl_jax.units import DT_S, TIMES_S
 from tests.helpers.scenes import random_positions, random_scene, scene
 

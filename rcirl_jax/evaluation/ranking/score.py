@@ -14,7 +14,8 @@ import numpy as np
 
 from rcirl_jax.data.store.rows import refuse_scenes
 from rcirl_jax.features import FeatureMap, feature_map
-from rcirl_jax.features.columns import COLUMNS, make_frame
+from rcirl_jax.features.columns import COLUMNS
+from rcirl_jax.features.mapping import make_frame
 from rcirl_jax.geometry.polynomial import hermite
 from rcirl_jax.planner.baselines import (
     Idm,
