@@ -22,8 +22,8 @@ import numpy as np
 from absl import app, flags
 
 from benchmarks.common import percentiles, write
-from rcirl_jax.export import Reward, RewardWeights, save
-from rcirl_jax.export.own_planner.plain import plain_scene
+from rcirl_jax.export import Reward, save
+from rcirl_jax.export.own_planner.builder import plain_scene
 from rcirl_jax.features import feature_map
 from rcirl_jax.types import Scene
 from tests.helpers import drawn_scenes, own_planner
@@ -42,7 +42,7 @@ NUMPY_CALLS = 50
 NETWORKS = {  # hidden units, by context
     "linear": ((), False),
     "15": ((15,), False),
-    "15_by_context": ((15,), True),
+    "15_scene_gating": ((15,), True),
     "64": ((64,), False),
     "32x16": ((32, 16), False),
 }
@@ -59,7 +59,7 @@ def built(name: str, native: str) -> Path:
     return folder
 
 
-def network(hidden: tuple[int, ...], scene_gating: bool) -> RewardWeights:
+def network(hidden: tuple[int, ...], scene_gating: bool) -> Reward:
     """A random reward of the size of trained ones: 21 features, 18 times."""
     drawn = example_weights(0, 21, 18, hidden, "tanh", scene_gating)
     return dataclasses.replace(

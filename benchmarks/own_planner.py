@@ -20,7 +20,7 @@ from absl import app, flags
 from benchmarks.common import write
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.export import Reward
-from rcirl_jax.export.own_planner.plain import plain_scene
+from rcirl_jax.export.own_planner.builder import plain_scene
 from rcirl_jax.features import FeatureMap
 from rcirl_jax.types import Demonstration, Scene
 from tests.helpers import drawn_scenes, own_planner

@@ -14,7 +14,7 @@ from absl import flags
 from rcirl_jax.cli.running import run
 from rcirl_jax.data.store.dataset import open_datasets
 from rcirl_jax.data.store.splits import with_tags
-from rcirl_jax.export.forms.stablehlo import exported, write_stablehlo
+from rcirl_jax.export.forms import exported, write_stablehlo
 from rcirl_jax.export.from_run import datasets_of, export_run, tags_of
 from rcirl_jax.export.loading import open_reward
 

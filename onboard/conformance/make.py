@@ -14,7 +14,7 @@ import jax
 import numpy as np
 import numpy.typing as npt
 
-from rcirl_jax.export.own_planner.plain import plain_scene
+from rcirl_jax.export.own_planner.builder import plain_scene
 from rcirl_jax.features import feature_map
 from rcirl_jax.runtime.atomic_files import write_whole
 from rcirl_jax.types import Kind, Scene

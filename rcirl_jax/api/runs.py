@@ -20,8 +20,7 @@ from rcirl_jax.evaluation.gate.verdict import write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.report import RankingReport, format_table
-from rcirl_jax.export.closed_loop import SuiteJob, run_job
-from rcirl_jax.export.gate_job import gate_job, judged
+from rcirl_jax.export.closed_loop import SuiteJob, gate_job, judged, run_job
 from rcirl_jax.export.loading import load_runs, open_reward
 from rcirl_jax.runtime.executors import Executor, Serial
 from rcirl_jax.runtime.pipeline import only_one

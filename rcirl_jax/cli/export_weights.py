@@ -24,12 +24,12 @@ from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.dataset import open_datasets
 from rcirl_jax.data.store.splits import with_tags
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.forms.linear_yaml import reward_yaml
-from rcirl_jax.export.forms.onnx_model import write_onnx
-from rcirl_jax.export.forms.stablehlo import (
+from rcirl_jax.export.forms import (
     Form,
     exported,
     exported_run,
+    reward_yaml,
+    write_onnx,
     write_stablehlo,
 )
 from rcirl_jax.export.from_run import datasets_of, export_run, tags_of

@@ -22,8 +22,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.likeness import DRIVES
 from rcirl_jax.evaluation.gate.verdict import write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
-from rcirl_jax.export.closed_loop import read_tuned_idm
-from rcirl_jax.export.gate_job import gate_job, judged
+from rcirl_jax.export.closed_loop import gate_job, judged, read_tuned_idm
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.simulation.rows import BASELINES
 

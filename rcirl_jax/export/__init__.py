@@ -10,8 +10,6 @@ from rcirl_jax.export.reader import (
 )
 from rcirl_jax.export.weights import (
     PROVENANCE_KEYS,
-    FeatureSpec,
-    RewardWeights,
     pack,
     save,
     to_json,
@@ -19,13 +17,11 @@ from rcirl_jax.export.weights import (
 
 __all__ = [
     "PROVENANCE_KEYS",
-    "FeatureSpec",
     "Guard",
     "GuardResult",
     "Limits",
     "PriorCost",
     "Reward",
-    "RewardWeights",
     "WeightsError",
     "decode_weights",
     "load_weights",

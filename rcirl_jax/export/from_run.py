@@ -1,9 +1,7 @@
 """A training run -> weights.msgpack with verification samples."""
 
 import datetime
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +10,7 @@ import numpy as np
 from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.errors import MALFORMED, InputError
 from rcirl_jax.export.reader import PriorCost, Reward
-from rcirl_jax.export.weights import FeatureSpec, RewardWeights, save
+from rcirl_jax.export.weights import save
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import (
     Normaliser,
@@ -28,31 +26,23 @@ from rcirl_jax.runtime.checked import typed_settings
 from rcirl_jax.train.featurise import featurised, host_batch, normaliser_rows
 from rcirl_jax.train.loop import restore_run
 from rcirl_jax.train.metrics import read_metrics
-from rcirl_jax.train.state import TrainConfig, TrainState
+from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.units import TIMES_S
 
 NUM_SAMPLES = 32  # verification samples in the file
 
 
-def _config_of(settings: Mapping[str, Any]) -> TrainConfig:
-    """The configuration of its fields as JSON types.
-
-    Raises:
-      ValueError, KeyError, TypeError: they are not those of this version.
-    """
-    for name in ("reward", "sampler"):
-        settings[name]  # these are no flags with a default
-    return typed_settings(TrainConfig, settings)
-
-
 def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
-    """The configuration a run was made with, and all of run.json."""
+    """Return the configuration a run was made with, and all of run.json."""
     path = workdir / "run.json"
     if not path.is_file():
         raise InputError(f"{path}: missing: expected a run made by `rcirl train`")
     run = read_json(path, "a run of this version")
     try:
-        config = _config_of(run["config"])
+        settings = run["config"]
+        for name in ("reward", "sampler"):
+            settings[name]  # these are no flags with a default
+        config = typed_settings(TrainConfig, settings)
         if not isinstance(run.get("flags", {}), dict):
             raise ValueError("flags: not a table")
     except MALFORMED as error:
@@ -61,7 +51,7 @@ def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
 
 
 def datasets_of(workdir: Path) -> list[str]:
-    """The datasets that a run's flags name.
+    """Return the datasets that a run's flags name.
 
     Raises:
       InputError: no run, or flags that name none that a file can have.
@@ -78,50 +68,8 @@ def datasets_of(workdir: Path) -> list[str]:
 
 
 def tags_of(workdir: Path) -> list[str]:
-    """The tags of scenes that a run's flags name, [] for all scenes."""
+    """Return the tags of scenes that a run's flags name, [] for all scenes."""
     return list(read_config(workdir)[1].get("flags", {}).get("tags") or [])
-
-
-def reward_weights(
-    params: RewardParams,
-    normaliser: Normaliser,
-    config: TrainConfig,
-    provenance: dict,
-    seen: np.ndarray,
-    *,
-    prior_cost: PriorCost | None = None,
-) -> RewardWeights:
-    """The effective weights of trained parameters, as the file holds them."""
-    features = feature_map(config.features)
-    effective = effective_params(params, config.reward)
-    kernels, biases = layers_of(effective["point"])
-    return RewardWeights(
-        preset=config.features,
-        features=tuple(
-            FeatureSpec(name=s.name, unit=s.unit, none_value=s.none)
-            for s in features.specs
-        ),
-        lower=np.asarray(normaliser.lower),
-        upper=np.asarray(normaliser.upper),
-        location=np.asarray(normaliser.location),
-        scale=np.asarray(normaliser.scale),
-        times=TIMES_S,
-        gamma=np.asarray(effective["gamma"]),
-        kernels=tuple(np.asarray(kernel) for kernel in kernels),
-        scene_gating=np.asarray(effective["scene_gating"])
-        if "scene_gating" in effective
-        else None,
-        training_range=seen,
-        prior_cost=prior_cost,
-        biases=(*(np.asarray(bias) for bias in biases), np.zeros(1)),
-        activation=config.reward.hidden_activation,
-        leaky_slope=LEAKY_SLOPE,
-        loss={
-            "name": config.loss,
-            "leaky_rate": config.leaky_rate if config.loss == "rank" else None,
-        },
-        provenance=provenance,
-    )
 
 
 def export_run(
@@ -156,13 +104,27 @@ def export_run(
     state = restore_run(workdir, config)
     rows = normaliser_rows(dataset, config)
     seen = seen_range(rows, feature_map(config.features))
+    same = ("git_commit", "machine", "cpu", "cores", "device", "devices")
+    provenance = {
+        **{name: run.get(name) for name in same},
+        **{name: run[name] for name in ("code_sha256", "environment") if name in run},
+        "dataset_sha256": run["dataset_hash"],
+        "seed": config.seed,
+        "flags": run.get("flags", {}),
+        "metrics": last_metrics(workdir),
+        "versions": run.get("versions", {}),
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "steps": int(state.step),
+        "mode": config.sampler.mode,
+        "config": run["config"],
+    }
     return write_weights(
         output,
         state.params,
         state.normaliser,
         config,
         verification_samples(dataset, config),
-        _provenance(workdir, state, config, run),
+        provenance,
         seen,
         prior_cost=prior_cost,
     )
@@ -194,8 +156,29 @@ def write_weights(
     """
     x, valid = map(jnp.asarray, samples)
     values = value(RewardModel(config.reward), params, normaliser, x, valid)
-    weights = reward_weights(
-        params, normaliser, config, provenance, seen, prior_cost=prior_cost
+    features = feature_map(config.features)
+    effective = effective_params(params, config.reward)
+    kernels, biases = layers_of(effective["point"])
+    weights = Reward(
+        preset=config.features,
+        names=features.names,
+        units=tuple(spec.unit for spec in features.specs),
+        none_values=tuple(spec.none for spec in features.specs),
+        **{name: np.asarray(x) for name, x in vars(normaliser).items()},
+        times=TIMES_S,
+        gamma=np.asarray(effective["gamma"]),
+        kernels=tuple(map(np.asarray, kernels)),
+        biases=(*map(np.asarray, biases), np.zeros(1)),
+        activation=config.reward.hidden_activation,
+        leaky_slope=LEAKY_SLOPE,
+        scene_gating=effective.get("scene_gating"),
+        training_range=seen,
+        prior_cost=prior_cost,
+        loss={
+            "name": config.loss,
+            "leaky_rate": config.leaky_rate if config.loss == "rank" else None,
+        },
+        provenance=provenance,
     )
     output.parent.mkdir(parents=True, exist_ok=True)
     return save(output, weights, *samples, np.asarray(values))
@@ -204,7 +187,7 @@ def write_weights(
 def verification_samples(
     dataset: Demonstrations, config: TrainConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """[m, T, F] features and [m, T] masks: half humans, half candidates."""
+    """Return [m, T, F] features and [m, T] masks: half humans, half candidates."""
     count = min(NUM_SAMPLES // 2, dataset.indices("train").size)
     index = dataset.indices("train")[:count]
     batch = jax.device_put(host_batch(dataset.read(index), np.ones(count), index))
@@ -216,27 +199,7 @@ def verification_samples(
     return np.concatenate([human, picked]), np.concatenate([valid, valid])
 
 
-def _provenance(
-    workdir: Path, state: TrainState, config: TrainConfig, run: dict
-) -> dict:
-    return {
-        "dataset_sha256": run["dataset_hash"],
-        "git_commit": run.get("git_commit"),
-        "seed": config.seed,
-        "flags": run.get("flags", {}),
-        "metrics": last_metrics(workdir),
-        "versions": run.get("versions", {}),
-        **{name: run.get(name) for name in ("machine", "cpu", "cores")},
-        **{name: run.get(name) for name in ("device", "devices")},
-        **{k: run[k] for k in ("code_sha256", "environment") if k in run},
-        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "steps": int(state.step),
-        "mode": config.sampler.mode,
-        "config": run["config"],
-    }
-
-
 def last_metrics(workdir: Path) -> dict:
-    """The last whole line of metrics.jsonl, or nothing."""
+    """Return the last whole line of metrics.jsonl, or nothing."""
     rows = read_metrics(workdir / "metrics.jsonl")
     return {k: v for k, v in rows[-1].items() if v is not None} if rows else {}

@@ -12,7 +12,14 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.score import PriorCostScorer
-from rcirl_jax.export.reader import PriorCost, Reward, WeightsError, load_weights
+from rcirl_jax.export.reader import (
+    FAMILIARITY,
+    RANGES,
+    PriorCost,
+    Reward,
+    WeightsError,
+    load_weights,
+)
 from rcirl_jax.features.mapping import FeatureMap, feature_map, known_presets
 from rcirl_jax.reward import effective_model, value
 from rcirl_jax.reward.familiarity import Familiarity
@@ -81,7 +88,7 @@ def check_provenance(found: Mapping[str, Any], file: str) -> None:
 
 
 def reward_params(reward: Reward) -> tuple[RewardParams, Normaliser]:
-    """A weights file's numbers as the pytrees that JAX code takes.
+    """Return a weights file's numbers as the pytrees that JAX code takes.
 
     Files hold effective (pinned) parameters; the output bias, 0 in every file
     of ours, cancels between the candidates of a scene.
@@ -99,23 +106,15 @@ def reward_params(reward: Reward) -> tuple[RewardParams, Normaliser]:
         "point": point_of(list(reward.kernels), list(reward.biases[:-1])),
         **gated,
     }
-    return (
-        jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), params),
-        Normaliser(
-            lower=jnp.asarray(reward.lower, jnp.float32),
-            upper=jnp.asarray(reward.upper, jnp.float32),
-            location=jnp.asarray(reward.location, jnp.float32),
-            scale=jnp.asarray(reward.scale, jnp.float32),
-        ),
-    )
+    single = functools.partial(jnp.asarray, dtype=jnp.float32)
+    ranges = {name: single(getattr(reward, name)) for name in RANGES}
+    return jax.tree.map(single, params), Normaliser(**ranges)
 
 
 def familiarity_of(prior_cost: PriorCost) -> Familiarity:
-    """A weights file's prior cost as the pytree that JAX code takes."""
-    names = ("location", "scale", "kernel", "bias", "out")
-    arrays = {n: jnp.asarray(getattr(prior_cost, n), jnp.float32) for n in names}
-    offset = jnp.asarray(np.ravel(prior_cost.offset)[0], jnp.float32)
-    return Familiarity(**arrays, offset=offset)
+    """Return a weights file's prior cost as the pytree that JAX code takes."""
+    leaves = {n: jnp.asarray(getattr(prior_cost, n), jnp.float32) for n in FAMILIARITY}
+    return Familiarity(**{**leaves, "offset": leaves["offset"].ravel()[0]})
 
 
 def scorer_of(reward: Reward) -> Scorer | PriorCostScorer:
@@ -174,54 +173,44 @@ def row_name(reward: Reward) -> str:
     return f"{words} {shape if hidden else 'linear'}{by_scene}{on}"
 
 
-def _seed(reward: Reward) -> int:
-    return int(reward.provenance.get("seed") or 0)
+def _rows(rewards: Sequence[Reward]) -> list[tuple[str, str]]:
+    """Return of each reward the row of its kind, and a name of its own.
 
+    Those of one loss and network are seeds of one row. Where two of them have the same
+    seed, each is a row by its file.
 
-def _rows(rewards: Sequence[Reward]) -> list[tuple[str, bool, bool]]:
-    """Return (row name, shared with others, those have a seed each) per reward."""
-    names = [row_name(reward) for reward in rewards]
-    seeds: dict[str, list[int]] = {}
-    for name, reward in zip(names, rewards, strict=True):
-        seeds.setdefault(name, []).append(_seed(reward))
-    return [(n, len(seeds[n]) > 1, len({*seeds[n]}) == len(seeds[n])) for n in names]
+    Raises:
+      InputError: a file twice.
+    """
+    parts = [Path(os.path.abspath(reward.file)).parts for reward in rewards]
+    for number, one in enumerate(parts):
+        if one in parts[:number]:
+            raise InputError(
+                f"weights: {rewards[number].file}: met twice: expected distinct files"
+            )
+    files, count = [one[-1] for one in parts], 1
+    while len(set(files)) < len(files):  # as many folders as tell them apart
+        count += 1
+        files = ["/".join(one[-count:]) for one in parts]
+    kinds = [row_name(reward) for reward in rewards]
+    seeds = [int(reward.provenance.get("seed") or 0) for reward in rewards]
+    found = []
+    for kind, seed, file in zip(kinds, seeds, files, strict=True):
+        alike = [s for k, s in zip(kinds, seeds, strict=True) if k == kind]
+        by_seed = len({*alike}) == len(alike)
+        own = f"{kind} ({f'seed {seed}' if by_seed else file})"
+        own = own if len(alike) > 1 else kind
+        found.append((kind if by_seed else own, own))
+    return found
 
 
 def row_names(rewards: Sequence[Reward]) -> list[str]:
     """Return names of rewards that have a row each: loss, network, what differs.
 
-    Those of one loss and network are told apart by their seeds or, where two have the
-    same seed, by their files.
-
     Raises:
       InputError: a file twice.
     """
-    short = short_names([reward.file for reward in rewards])
-    found = []
-    for reward, file, row in zip(rewards, short, _rows(rewards), strict=True):
-        name, shared, by_seed = row
-        own = f"seed {_seed(reward)}" if by_seed else file
-        found.append(f"{name} ({own})" if shared else name)
-    return found
-
-
-def short_names(files: Sequence[str]) -> list[str]:
-    """Return names of files, with as many folders before them as tell them apart.
-
-    Raises:
-      InputError: a file twice.
-    """
-    parts = [Path(os.path.abspath(file)).parts for file in files]
-    for number, one in enumerate(parts):
-        if one in parts[:number]:
-            raise InputError(
-                f"weights: {files[number]}: met twice: expected distinct files"
-            )
-    names, count = [one[-1] for one in parts], 1
-    while len(set(names)) < len(names):
-        count += 1
-        names = ["/".join(one[-count:]) for one in parts]
-    return names
+    return [own for _, own in _rows(rewards)]
 
 
 def prior_cost_words(name: str, reward: Reward) -> str:
@@ -257,9 +246,6 @@ def load_runs(
         )
     preset, mode = settings.pop()
     runs: dict[str, list[Scorer | PriorCostScorer]] = {}
-    for reward, own, row in zip(
-        rewards, row_names(rewards), _rows(rewards), strict=True
-    ):
-        name, _, by_seed = row
-        runs.setdefault(name if by_seed else own, []).append(scorer_of(reward))
+    for reward, (row, _) in zip(rewards, _rows(rewards), strict=True):
+        runs.setdefault(row, []).append(scorer_of(reward))
     return runs, preset, SamplerConfig(mode=mode)

@@ -50,15 +50,41 @@ MAX_NODES = 2**16  # entries of all lists and maps of a file together
 MAX_DEPTH = 8  # levels of lists and maps, `provenance` itself the first
 
 OUTER_KEYS = ("magic", "schema_version", "body", "sha256")
-RANGES = ("lower", "upper", "location", "scale")
-FAMILIARITY_KEYS = ("location", "scale", "kernel", "bias", "out", "offset")
-PRIOR_COST_KEYS = ("incumbent", "low", "high", "familiarity")
-SAMPLE_KEYS = ("features", "valid", "value", "gain")
-BODY_KEYS = (
-    *("preset", "features", "normaliser", "training_range", "times", "gamma"),
-    *("layers", "activation", "leaky_slope", "scene_gating", "prior_cost"),
-    *("loss", "provenance", "samples"),
-)
+AXES = {
+    **{"F": MAX_FEATURES, "T": MAX_TIMES, "m": MAX_SAMPLES},
+    **{"in": MAX_UNITS, "out": MAX_UNITS, "H": MAX_UNITS},
+}
+RANGES = dict.fromkeys(("lower", "upper", "location", "scale"), "F")
+FAMILIARITY = {
+    **{"location": "F", "scale": "F", "kernel": "F H", "bias": "H", "out": "H"},
+    "offset": "1",
+}
+# The body, in the order of its keys: the one description of the file, for this reader
+# and for the writer. A map has these keys and no others; a list, rows of one kind; what
+# stands in a tuple may be nil. An array is named by its axes: one name, one length.
+BODY: dict[str, Any] = {
+    "preset": "text",
+    "features": [{"name": "text", "unit": "text", "none_value": "number"}],
+    "normaliser": RANGES,
+    "training_range": "2 F",
+    "times": "T",
+    "gamma": "T",
+    "layers": [{"kernel": "in out", "bias": "out"}],
+    "activation": "text",
+    "leaky_slope": "number",
+    "scene_gating": ("F F",),
+    "prior_cost": (
+        {
+            "incumbent": "text",
+            "low": "number",
+            "high": "number",
+            "familiarity": FAMILIARITY,
+        },
+    ),
+    "loss": {"name": "text", "leaky_rate": ("number",)},
+    "provenance": "plain",
+    "samples": {"features": "m T F", "valid": "m T", "value": "m", "gain": ("m",)},
+}
 ACTIVATIONS: dict[str, Callable[[np.ndarray, np.float32], np.ndarray]] = {
     "tanh": lambda x, slope: np.tanh(x),
     "relu": lambda x, slope: np.maximum(x, np.float32(0.0)),
@@ -108,28 +134,28 @@ class PriorCost:
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Reward:
-    """A verified reward. Arrays are float32 and read-only."""
+    """A reward in its effective weights. Of a file: verified, arrays read-only."""
 
-    file: str
-    sha256: str  # of the body; names this reward
-    preset: str
+    file: str = ""
+    sha256: str = ""  # of the body; names this reward
+    preset: str  # of data_specs/features
     names: tuple[str, ...]  # [F]
-    units: tuple[str, ...]  # [F]
+    units: tuple[str, ...]  # [F] SI; "1" for a pure number
     none_values: tuple[float, ...]  # [F] a feature's value when nothing is there
     lower: np.ndarray  # [F] in the feature's unit
     upper: np.ndarray  # [F]
     location: np.ndarray  # [F]
     scale: np.ndarray  # [F] > 0
-    times: np.ndarray  # [T] s, from 0
+    times: np.ndarray  # [T] s, increasing from 0
     gamma: np.ndarray  # [T]
     kernels: tuple[np.ndarray, ...]  # [F, H1], ..., [H, 1]
     biases: tuple[np.ndarray, ...]  # [H1], ..., [1]
-    activation: str
+    activation: str  # of the hidden layers, one of ACTIVATIONS
     leaky_slope: float  # negative slope of "leaky_relu"
-    scene_gating: np.ndarray | None  # [F, F] C, the scene gating
+    scene_gating: np.ndarray | None = None  # [F, F] C, the scene gating
     training_range: np.ndarray  # [2, F] ends of the training's range
-    prior_cost: PriorCost | None  # drives on top of an incumbent, by `total`
-    loss: dict[str, Any]
+    prior_cost: PriorCost | None = None  # drives on top of an incumbent, by `total`
+    loss: dict[str, Any]  # name; leaky_rate of the rank loss, or None
     provenance: dict[str, Any]
 
     @property
@@ -229,26 +255,18 @@ class Reward:
 
     @np.errstate(all="ignore")
     def _values(self, features: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
-        x = self._normalise(features)
+        x = (np.clip(features, self.lower, self.upper) - self.location) / self.scale
         if self.scene_gating is not None:
             x = x * (
                 np.float32(2.0) / (1.0 + np.exp(-(x[..., :1, :] @ self.scene_gating)))
             )
-        terms = self.gamma * self._network(x)
-        if valid is not None:
-            terms = np.where(valid, terms, np.float32(0.0))
-        return np.asarray(np.sum(terms, axis=-1, dtype=np.float32))
-
-    @np.errstate(all="ignore")
-    def _normalise(self, features: np.ndarray) -> np.ndarray:
-        return (np.clip(features, self.lower, self.upper) - self.location) / self.scale
-
-    @np.errstate(all="ignore")
-    def _network(self, x: np.ndarray) -> np.ndarray:
         activate, slope = ACTIVATIONS[self.activation], np.float32(self.leaky_slope)
         for kernel, bias in zip(self.kernels[:-1], self.biases[:-1], strict=True):
             x = activate(x @ kernel + bias, slope)
-        return (x @ self.kernels[-1] + self.biases[-1])[..., 0]
+        terms = self.gamma * (x @ self.kernels[-1] + self.biases[-1])[..., 0]
+        if valid is not None:
+            terms = np.where(valid, terms, np.float32(0.0))
+        return np.asarray(np.sum(terms, axis=-1, dtype=np.float32))
 
     def _numbers(self, given: np.ndarray, last: tuple[int, ...]) -> np.ndarray:
         wanted = f"numbers of shape [..., {', '.join(map(str, last))}]"
@@ -320,112 +338,95 @@ def _decode(data: bytes, file: str) -> Reward:
     found = hashlib.sha256(body).hexdigest() if isinstance(body, bytes) else "no bytes"
     if outer["sha256"] != found or not isinstance(body, bytes):
         _fail("sha256", found, f"{_show(outer['sha256'])}; the file is damaged")
-    fields = _map("body", _unpack("body", body), BODY_KEYS)
-    reward = Reward(file=file, sha256=found, **_fields(fields))
+    fields = _read("body", _unpack("body", body), BODY, {})
+    reward = _reward(file, found, fields)
     _verify(reward, fields["samples"])
     return reward
 
 
-def _fields(body: dict[str, Any]) -> dict[str, Any]:
-    """Return every field of `Reward` that comes from the body, checked."""
-    features = _features(body["features"])
-    size = len(features["names"])
-    boxes = _map("normaliser", body["normaliser"], RANGES)
-    ranges = {key: _array(f"normaliser.{key}", boxes[key], (size,)) for key in RANGES}
-    lower, upper, _, scale = ranges.values()
-    _every("normaliser.lower", lower, lower <= upper, "at most upper")
-    _every("normaliser.scale", scale, scale > 0.0, "over 0")
-    times = _array("times", body["times"], (range(1, MAX_TIMES + 1),))
-    _every("times", times[:1], times[:1] == 0.0, "0 s first")
-    _every("times", times[1:], times[1:] > times[:-1], "increasing times")
-    activation = _text("activation", body["activation"])
-    if activation not in ACTIVATIONS:
-        _fail("activation", activation, f"one of {', '.join(ACTIVATIONS)}")
-    scene_gating, prior_cost = body["scene_gating"], body["prior_cost"]
-    if scene_gating is not None:
-        scene_gating = _array("scene_gating", scene_gating, (size, size))
-    training_range = _array("training_range", body["training_range"], (2, size))
-    _every(
-        "training_range",
-        training_range[:1],
-        training_range[:1] <= training_range[1:],
-        "at most the highest",
+def _read(field: str, value: Any, kind: Any, axes: dict[str, int]) -> Any:  # noqa: ANN401
+    """Return what stands in a field, checked against its kind in `BODY`.
+
+    Args:
+      field: its place, for messages.
+      value: as unpacked.
+      kind: text, number, plain, the axes of an array, or a structure of these.
+      axes: lengths of the axes met so far; those of this field are added.
+    """
+    if isinstance(kind, tuple):
+        return None if value is None else _read(field, value, kind[0], axes)
+    if isinstance(kind, dict):
+        at = "" if field == "body" else f"{field}."
+        box = _map(field, value, tuple(kind))
+        return {k: _read(f"{at}{k}", box[k], kind[k], axes) for k in kind}
+    if isinstance(kind, list):
+        most = MAX_FEATURES if field == "features" else MAX_LAYERS
+        if not isinstance(value, list) or not 1 <= len(value) <= most:
+            _fail(field, value, f"a list of 1 to {most}")
+        if field == "features":
+            axes |= {"F": len(value), "out": len(value)}
+        rows = []
+        for index, row in enumerate(value):
+            if "out" in axes:  # a layer takes what the one before gives
+                axes["in"] = axes.pop("out")
+            rows.append(_read(f"{field}[{index}]", row, kind[0], axes))
+        return rows
+    if kind == "text":
+        if not isinstance(value, str) or not 1 <= len(value) <= MAX_NAME:
+            _fail(field, value, f"a text of 1 to {MAX_NAME} characters")
+        return value
+    if kind == "number":
+        return _number(field, value)
+    if kind == "plain":
+        return _plain(field, value, MAX_DEPTH)
+    return _array(field, value, kind.split(), axes)
+
+
+def _reward(file: str, sha256: str, body: dict[str, Any]) -> Reward:
+    """Return the reward of a body, whose values are checked against each other."""
+    names, units, none_values = zip(
+        *(row.values() for row in body["features"]), strict=True
     )
-    loss = _map("loss", body["loss"], ("name", "leaky_rate"))
-    _text("loss.name", loss["name"])
-    if loss["leaky_rate"] is not None:
-        _number("loss.leaky_rate", loss["leaky_rate"])
-    return {
-        "preset": _text("preset", body["preset"]),
-        **features,
-        **ranges,
-        "times": times,
-        "gamma": _array("gamma", body["gamma"], (len(times),)),
-        **_layers(body["layers"], size),
-        "activation": activation,
-        "leaky_slope": _number("leaky_slope", body["leaky_slope"]),
-        "scene_gating": scene_gating,
-        "training_range": training_range,
-        "prior_cost": None if prior_cost is None else _prior_cost(prior_cost, size),
-        "loss": loss,
-        "provenance": _plain("provenance", body["provenance"], MAX_DEPTH),
-    }
-
-
-def _features(value: object) -> dict[str, tuple[Any, ...]]:
-    rows = []
-    for index, row in enumerate(_list("features", value, MAX_FEATURES)):
-        at = f"features[{index}]"
-        row = _map(at, row, ("name", "unit", "none_value"))
-        name, unit = _text(f"{at}.name", row["name"]), _text(f"{at}.unit", row["unit"])
-        if name in [before for before, _, _ in rows]:
-            _fail(f"{at}.name", name, "a name used once")
-        rows.append((name, unit, _number(f"{at}.none_value", row["none_value"])))
-    names, units, none_values = zip(*rows, strict=True)
-    return {"names": names, "units": units, "none_values": none_values}
-
-
-def _layers(value: object, width: int) -> dict[str, tuple[np.ndarray, ...]]:
-    """Return the chain F -> ... -> 1."""
-    kernels, biases = [], []
-    for index, row in enumerate(_list("layers", value, MAX_LAYERS)):
-        at = f"layers[{index}]"
-        row = _map(at, row, ("kernel", "bias"))
-        shape = (width, range(1, MAX_UNITS + 1))
-        kernels.append(_array(f"{at}.kernel", row["kernel"], shape))
-        width = kernels[-1].shape[1]
-        biases.append(_array(f"{at}.bias", row["bias"], (width,)))
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            _fail(f"features[{index}].name", name, "a name used once")
+    ranges, times, seen = (body[k] for k in ("normaliser", "times", "training_range"))
+    lower, upper, _, scale = ranges.values()
+    kernels, biases = zip(*(row.values() for row in body["layers"]), strict=True)
+    width = kernels[-1].shape[1]
     if width != 1:
         _fail(f"layers[{len(kernels) - 1}].kernel", width, "1 output, the reward")
-    return {"kernels": tuple(kernels), "biases": tuple(biases)}
-
-
-def _prior_cost(value: object, features: int) -> PriorCost:
-    """Return the prior cost, checked but for the gains of the samples."""
-    box = _map("prior_cost", value, PRIOR_COST_KEYS)
-    text = _text("prior_cost.incumbent", box["incumbent"])
-    low, high = (_number(f"prior_cost.{key}", box[key]) for key in ("low", "high"))
-    if low < 0.0:
-        _fail("prior_cost.low", low, "at least 0")
-    if high < low:
-        _fail("prior_cost.high", high, f"at least low, {_show(low)}")
-    at = "prior_cost.familiarity"
-    box = _map(at, box["familiarity"], FAMILIARITY_KEYS)
-    read = lambda key, *shape: _array(f"{at}.{key}", box[key], shape)  # noqa: E731
-    location, scale = read("location", features), read("scale", features)
-    kernel = read("kernel", features, range(1, MAX_UNITS + 1))
-    _every(f"{at}.scale", scale, scale > 0.0, "over 0")
-    units = kernel.shape[1]
-    return PriorCost(
-        incumbent=text,
-        low=low,
-        high=high,
-        location=location,
-        scale=scale,
-        kernel=kernel,
-        bias=read("bias", units),
-        out=read("out", units),
-        offset=read("offset", 1),
+    if body["activation"] not in ACTIVATIONS:
+        _fail("activation", body["activation"], f"one of {', '.join(ACTIVATIONS)}")
+    prior = body["prior_cost"]
+    if prior is not None:
+        low, high, familiarity = (prior[k] for k in ("low", "high", "familiarity"))
+        if low < 0.0:
+            _fail("prior_cost.low", low, "at least 0")
+        if high < low:
+            _fail("prior_cost.high", high, f"at least low, {_show(low)}")
+        spread = familiarity["scale"]
+        _every("prior_cost.familiarity.scale", spread, spread > 0.0, "over 0")
+        prior = PriorCost(
+            incumbent=prior["incumbent"], low=low, high=high, **familiarity
+        )
+    _every("normaliser.lower", lower, lower <= upper, "at most upper")
+    _every("normaliser.scale", scale, scale > 0.0, "over 0")
+    _every("times", times[:1], times[:1] == 0.0, "0 s first")
+    _every("times", times[1:], times[1:] > times[:-1], "increasing times")
+    _every("training_range", seen[:1], seen[:1] <= seen[1:], "at most the highest")
+    named = ("features", "normaliser", "layers", "prior_cost", "samples")
+    return Reward(
+        file=file,
+        sha256=sha256,
+        names=names,
+        units=units,
+        none_values=none_values,
+        **ranges,
+        kernels=kernels,
+        biases=biases,
+        prior_cost=prior,
+        **{key: value for key, value in body.items() if key not in named},
     )
 
 
@@ -441,13 +442,9 @@ def _plain(field: str, value: Any, depth: int) -> Any:  # noqa: ANN401
     return value
 
 
-def _verify(reward: Reward, samples: object) -> None:
+def _verify(reward: Reward, samples: dict[str, Any]) -> None:
     """Check that the file's samples score, and have gains, as the file says."""
-    found = _map("samples", samples, SAMPLE_KEYS)
-    wanted = _array("samples.value", found["value"], (range(1, MAX_SAMPLES + 1),))
-    shape = (len(wanted), len(reward.times), len(reward.names))
-    features = _array("samples.features", found["features"], shape)
-    valid = _array("samples.valid", found["valid"], shape[:2])
+    features, valid, wanted, gains = samples.values()
     _every("samples.valid", valid, (valid == 0.0) | (valid == 1.0), "0 or 1")
     if reward.scene_gating is not None or reward.prior_cost is not None:
         first = valid[:, :1]
@@ -458,15 +455,14 @@ def _verify(reward: Reward, samples: object) -> None:
         if not abs(scored - want) <= TOLERANCE * max(1.0, abs(want)):
             need = f"{want:.9g} within {TOLERANCE:g} of max(1, |V|)"
             _fail(f"samples[{index}]", f"scored {scored:.9g}", need)
-    if reward.prior_cost is None:
-        if found["gain"] is not None:
-            _fail("samples.gain", found["gain"], "none without a prior cost")
-        return
-    gains = _array("samples.gain", found["gain"], (len(wanted),))
-    with np.errstate(all="ignore"):
-        error = np.abs(reward.prior_cost.gain(features[:, 0]).astype(float) - gains)
-    good = error <= TOLERANCE * np.maximum(1.0, np.abs(gains))
-    _every("samples.gain", gains, good, "the gain of the sample")
+    if (gains is None) != (reward.prior_cost is None):
+        given, need = ("given", "none without") if gains is not None else (None, "with")
+        _fail("samples.gain", given, f"{need} a prior cost")
+    if gains is not None and reward.prior_cost is not None:
+        with np.errstate(all="ignore"):
+            error = np.abs(reward.prior_cost.gain(features[:, 0]).astype(float) - gains)
+        good = error <= TOLERANCE * np.maximum(1.0, np.abs(gains))
+        _every("samples.gain", gains, good, "the gain of the sample")
 
 
 def _unpack(field: str, data: bytes) -> object:
@@ -529,38 +525,33 @@ def _map(field: str, value: object, keys: tuple[str, ...]) -> dict[str, Any]:
     return value
 
 
-def _list(field: str, value: object, most: int) -> list[Any]:
-    if not isinstance(value, list) or not 1 <= len(value) <= most:
-        _fail(field, value, f"a list of 1 to {most}")
-    return value
-
-
-def _text(field: str, value: object) -> str:
-    if not isinstance(value, str) or not 1 <= len(value) <= MAX_NAME:
-        _fail(field, value, f"a text of 1 to {MAX_NAME} characters")
-    return value
-
-
 def _number(field: str, value: Any, expected: str = "a finite number") -> float:  # noqa: ANN401
     if type(value) not in (int, float) or not math.isfinite(value):
         _fail(field, value, expected)
     return float(value)
 
 
-def _array(field: str, value: object, shape: tuple[int | range, ...]) -> np.ndarray:
-    """Return a finite float32 array; an axis has a length or limits."""
+def _array(
+    field: str, value: object, names: Sequence[str], axes: dict[str, int]
+) -> np.ndarray:
+    """Return a finite float32 array whose axes have these names, or lengths."""
     box = _map(field, value, ("shape", "dtype", "data"))
-    axes, data = box["shape"], box["data"]
+    shape, data = box["shape"], box["data"]
     if box["dtype"] != "<f4":
         _fail(f"{field}.dtype", box["dtype"], "<f4")
-    limits = [want if isinstance(want, range) else (want,) for want in shape]
-    fits = isinstance(axes, list) and len(axes) == len(shape)
-    pairs = zip(axes, limits, strict=True) if fits else [(axes, ())]
-    if not all(type(n) is int and n in limit for n, limit in pairs):
-        _fail(f"{field}.shape", str(axes[:8]) if fits else axes, str(list(shape)))
-    if not isinstance(data, bytes) or len(data) != 4 * math.prod(axes):
-        _fail(f"{field}.data", data, f"{4 * math.prod(axes)} bytes")
-    array = np.frombuffer(data, "<f4").reshape(axes).astype(np.float32)
+    lengths = [int(n) if n.isdigit() else axes.get(n) for n in names]
+    most = [n or AXES[name] for n, name in zip(lengths, names, strict=True)]
+    least = [n or 1 for n in lengths]
+    fits = isinstance(shape, list) and len(shape) == len(names)
+    pairs = zip(shape, least, most, strict=True) if fits else [(shape, 0, 0)]
+    if not all(type(n) is int and low <= n <= high for n, low, high in pairs):
+        ends = zip(least, most, strict=True)
+        need = ", ".join(str(a) if a == b else f"{a} to {b}" for a, b in ends)
+        _fail(f"{field}.shape", str(shape[:8]) if fits else shape, f"[{need}]")
+    axes |= {name: n for name, n in zip(names, shape, strict=True) if name in AXES}
+    if not isinstance(data, bytes) or len(data) != 4 * math.prod(shape):
+        _fail(f"{field}.data", data, f"{4 * math.prod(shape)} bytes")
+    array = np.frombuffer(data, "<f4").reshape(shape).astype(np.float32)
     array.flags.writeable = False
     _every(field, array, np.isfinite(array), "finite numbers")
     return array

@@ -35,47 +35,8 @@ PROVENANCE_KEYS = (
 )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FeatureSpec:
-    """One column of the feature matrix, as the planner must deliver it."""
-
-    name: str
-    unit: str  # SI; "1" for a pure number
-    none_value: float  # value when nothing of the class is there
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class RewardWeights:
-    """A reward in its effective weights: constraints are applied already.
-
-    x = (clip(f, lower, upper) - location) / scale, scaled by the scene's gains if
-    there is scene gating, then the layers, the last one linear with one output;
-    V = sum_t gamma_t * time_valid_t * r_t, higher is better. Arrays are anything
-    numpy can turn into float32.
-    """
-
-    preset: str  # of data_specs/features
-    features: tuple[FeatureSpec, ...]  # [F]
-    lower: np.ndarray  # [F] in the feature's unit
-    upper: np.ndarray  # [F]
-    location: np.ndarray  # [F]
-    scale: np.ndarray  # [F] > 0
-    times: np.ndarray  # [T] s, increasing from 0
-    gamma: np.ndarray  # [T]
-    kernels: tuple[np.ndarray, ...]  # [F, H1], ..., [H, 1]
-    biases: tuple[np.ndarray, ...]  # [H1], ..., [1]; one for every kernel
-    scene_gating: np.ndarray | None = None  # [F, F] scene gating; None: one reward
-    training_range: np.ndarray  # [2, F], ends of the training's range
-    # of a reward driven on top of an incumbent
-    prior_cost: reader.PriorCost | None = None
-    activation: str  # of the hidden layers: tanh, relu, leaky_relu, identity
-    leaky_slope: float  # negative slope of the hidden leaky_relu
-    loss: Mapping[str, Any]  # name; leaky_rate of the rank loss, or None
-    provenance: Mapping[str, Any]  # the PROVENANCE_KEYS and what the caller adds
-
-
 def pack(
-    weights: RewardWeights,
+    weights: reader.Reward,
     samples_x: np.ndarray,
     samples_valid: np.ndarray,
     samples_value: np.ndarray,
@@ -83,7 +44,8 @@ def pack(
     """Return the bytes of the file, checked by reading them back.
 
     Args:
-      weights: effective weights.
+      weights: effective weights, any scale pinning already applied. Arrays are
+        anything numpy can turn into float32; `file` and `sha256` do not count.
       samples_x: [m, T, F] raw features of the verification samples (before the
         clip and the normaliser, so that a reader checks those too), m <= 256.
       samples_valid: [m, T] bool.
@@ -102,7 +64,7 @@ def pack(
 
 def save(
     path: str | os.PathLike[str],
-    weights: RewardWeights,
+    weights: reader.Reward,
     samples_x: np.ndarray,
     samples_valid: np.ndarray,
     samples_value: np.ndarray,
@@ -148,7 +110,7 @@ def _json(value: Any) -> Any:  # noqa: ANN401
 
 
 def _pack_checked(
-    file: str, weights: RewardWeights, samples: tuple[np.ndarray, ...]
+    file: str, weights: reader.Reward, samples: tuple[np.ndarray, ...]
 ) -> tuple[bytes, reader.Reward]:
     try:
         body = _dump(_body(weights, samples))
@@ -172,61 +134,51 @@ def _dump(value: dict[str, Any]) -> bytes:
     return cast("bytes", msgpack.packb(value, use_bin_type=True))
 
 
-def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, Any]:
-    """Return the body map, in the order of `reader.BODY_KEYS`."""
+def _body(weights: reader.Reward, samples: tuple[np.ndarray, ...]) -> dict[str, Any]:
+    """Return the body map, as `reader.BODY` describes it."""
     if len(weights.kernels) != len(weights.biases):
         found = f"{len(weights.biases)} biases"
         raise ValueError(f"biases: {found}: expected one for each kernel")
     for key in PROVENANCE_KEYS:
         if key not in weights.provenance:
             raise ValueError(f"provenance.{key}: missing: expected a value or None")
-
-    def maybe(field: str, value: Any) -> Any:  # noqa: ANN401
-        return None if value is None else _array(field, value)
-
+    columns = zip(weights.names, weights.units, weights.none_values, strict=True)
     layers = zip(weights.kernels, weights.biases, strict=True)
     prior, gains = weights.prior_cost, None
     if prior is not None:
-        arrays = {
-            key: _array(f"prior_cost.familiarity.{key}", getattr(prior, key))
-            for key in reader.FAMILIARITY_KEYS
-        }
-        stored = {n: np.asarray(getattr(prior, n), np.float32) for n in arrays}
+        arrays = {key: getattr(prior, key) for key in reader.FAMILIARITY}
         try:
+            stored = {key: np.asarray(x, np.float32) for key, x in arrays.items()}
             first = np.asarray(samples[0], np.float32)[:, 0]
             gains = dataclasses.replace(prior, **stored).gain(first)
         except (IndexError, TypeError, ValueError):
-            gains = np.zeros(1)  # the reader names what does not fit
-        numbers = {"low": _plain(prior.low), "high": _plain(prior.high)}
-        prior = {"incumbent": prior.incumbent, **numbers, "familiarity": arrays}
-    return {
-        "preset": weights.preset,
-        "features": [_plain(vars(spec)) for spec in weights.features],
-        "normaliser": {
-            key: _array(f"normaliser.{key}", getattr(weights, key))
-            for key in reader.RANGES
-        },
-        "training_range": _array("training_range", weights.training_range),
-        "times": _array("times", weights.times),
-        "gamma": _array("gamma", weights.gamma),
-        "layers": [
-            {
-                "kernel": _array(f"layers[{index}].kernel", kernel),
-                "bias": _array(f"layers[{index}].bias", bias),
-            }
-            for index, (kernel, bias) in enumerate(layers)
-        ],
-        "activation": weights.activation,
-        "leaky_slope": _plain(weights.leaky_slope),
-        "scene_gating": maybe("scene_gating", weights.scene_gating),
+            gains = np.zeros(1)  # what does not fit is named below, or by the reader
+        prior = {**vars(prior), "familiarity": arrays}
+    row = lambda kind, values: dict(zip(kind[0], values, strict=True))  # noqa: E731
+    body = {
+        **vars(weights),
+        "features": [row(reader.BODY["features"], column) for column in columns],
+        "normaliser": vars(weights),
+        "layers": [row(reader.BODY["layers"], layer) for layer in layers],
         "prior_cost": prior,
-        "loss": _plain(weights.loss),
-        "provenance": _plain(weights.provenance),
-        "samples": {
-            name: maybe(f"samples.{name}", sample)
-            for name, sample in zip(reader.SAMPLE_KEYS, (*samples, gains), strict=True)
-        },
+        "samples": row([reader.BODY["samples"]], (*samples, gains)),
     }
+    return _encoded("", body, reader.BODY)
+
+
+def _encoded(field: str, value: Any, kind: Any) -> Any:  # noqa: ANN401
+    """Return what the file holds of a value, by its kind in `reader.BODY`."""
+    if isinstance(kind, tuple):
+        return None if value is None else _encoded(field, value, kind[0])
+    if isinstance(kind, list):
+        rows = enumerate(value)
+        return [_encoded(f"{field}[{n}]", row, kind[0]) for n, row in rows]
+    if isinstance(kind, dict):
+        at = f"{field}." if field else ""
+        return {key: _encoded(f"{at}{key}", value[key], kind[key]) for key in kind}
+    if kind in ("text", "number", "plain"):
+        return _plain(value)
+    return _array(field, value)
 
 
 def _array(field: str, value: np.ndarray) -> dict[str, Any]:

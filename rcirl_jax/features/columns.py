@@ -39,7 +39,10 @@ import numpy as np
 
 Array = Any  # of numpy, or of JAX
 # of rcirl_jax.types, or plain ones with the same fields
-Scene = Ego = Obstacles = Trajectory = Any
+Scene = Any
+Ego = Any
+Obstacles = Any
+Trajectory = Any
 
 NUM_TIMES = 18  # T
 HORIZON_S = 8.0  # s

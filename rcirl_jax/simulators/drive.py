@@ -19,8 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.own_planner.builder import scene_of
-from rcirl_jax.export.own_planner.line_frame import LineFrame, Parts
+from rcirl_jax.export.own_planner.builder import LineFrame, Parts, scene_of
 from rcirl_jax.geometry.frenet import ReferenceLine, project_lanes
 from rcirl_jax.planner.plan import Plan, command, later, no_plan, stations_from_now
 from rcirl_jax.planner.rank import Policy

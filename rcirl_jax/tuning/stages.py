@@ -28,9 +28,15 @@ from rcirl_jax.evaluation.gate.verdict import judge, pair_of, write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.report import format_table, from_json, to_json
-from rcirl_jax.export.closed_loop import SuiteJob, read_tuned_idm, write_tuned_idm
+from rcirl_jax.export.closed_loop import (
+    SuiteJob,
+    drive_job,
+    gate_job,
+    left_out,
+    read_tuned_idm,
+    write_tuned_idm,
+)
 from rcirl_jax.export.from_run import export_run
-from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
 from rcirl_jax.export.loading import open_reward, scorer_of
 from rcirl_jax.export.sweep import SWEEP, read_sweep
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW

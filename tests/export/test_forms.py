@@ -12,9 +12,7 @@ from onnx.reference import ReferenceEvaluator
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export import save
-from rcirl_jax.export.forms.linear_yaml import reward_yaml
-from rcirl_jax.export.forms.onnx_model import write_onnx
-from rcirl_jax.export.forms.stablehlo import exported, write_stablehlo
+from rcirl_jax.export.forms import exported, reward_yaml, write_onnx, write_stablehlo
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import load_weights
 from tests.helpers.commands import succeeded

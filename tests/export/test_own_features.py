@@ -1,6 +1,5 @@
 """The numpy file for planners: what it refuses, and that it needs numpy only."""
 
-import shutil
 import subprocess
 import sys
 
@@ -69,7 +68,6 @@ def test_nobody_reads_what_is_not_there():
     ("given", "line"),
     [
         ({"ego": ego(width=0.0)}, "ego.width: 0.0: expected over 0 m"),
-        ({"ego": ego(v=np.inf)}, "ego.v: inf: expected finite numbers"),
         ({"ego": ego(a="fast")}, "ego.a: fast: expected numbers"),
         (
             {"path": path(kappa=FLAT[1:])},
@@ -122,18 +120,11 @@ def test_unknown_columns_and_other_units_are_refused():
         FeatureMap(["l"], [])
 
 
-@pytest.mark.parametrize("copied", [True, False])
-def test_jax_is_not_loaded(tmp_path, copied):
-    if copied:
-        for module in (features, f):
-            shutil.copy(module.__file__, tmp_path)
-    block, name = "", features.__name__
-    if copied:
-        block, name = "sys.modules['rcirl_jax'] = None; ", "features"
+def test_jax_is_not_loaded():
+    """The copied files alone: tests/onboard/test_example.py."""
     script = (
-        f"import sys; {block}import {name}; "
+        f"import sys, {features.__name__}; "
         "loaded = {m.split('.')[0] for m in sys.modules}; "
         "assert not loaded & {'jax', 'flax', 'scipy'}, loaded"
     )
-    where = tmp_path if copied else REPO
-    subprocess.run([sys.executable, "-c", script], cwd=where, check=True)
+    subprocess.run([sys.executable, "-c", script], cwd=REPO, check=True)

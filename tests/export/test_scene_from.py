@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.own_planner.builder import scene_from
+from rcirl_jax.export.own_planner.builder import plain_scene, scene_from
 from rcirl_jax.export.own_planner.inputs import Body, Car, CentreLine, Signal
-from rcirl_jax.export.own_planner.plain import plain_scene
 from rcirl_jax.simulation.cases import LineKind
 from rcirl_jax.simulation.world import observe, road_limit, start
 from rcirl_jax.types import Kind

@@ -7,8 +7,13 @@ import shutil
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.closed_loop import read_tuned_idm, table_rows, write_tuned_idm
-from rcirl_jax.export.gate_job import gate_job, left_out
+from rcirl_jax.export.closed_loop import (
+    gate_job,
+    left_out,
+    read_tuned_idm,
+    table_rows,
+    write_tuned_idm,
+)
 from rcirl_jax.export.loading import load_runs, open_reward, row_name
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
 from tests.helpers.weights_files import random_weights

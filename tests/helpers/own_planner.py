@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.export import FeatureSpec, RewardWeights, save
+from rcirl_jax.export import save
 from rcirl_jax.export.loading import reward_params
 from rcirl_jax.export.own_planner import features as plain
 from rcirl_jax.features import FeatureMap, feature_map
@@ -15,7 +15,7 @@ from rcirl_jax.planner.rank import learned_score
 from rcirl_jax.sampling.kinematics import trajectory_from_positions, trajectory_on_path
 from rcirl_jax.types import Candidates
 from rcirl_jax.units import TIMES_S
-from tests.helpers.weights_files import example_weights, loop_value
+from tests.helpers.weights_files import columns_of, example_weights, loop_value
 
 TOLERANCE = 1e-5  # of max(1, |x|)
 
@@ -35,12 +35,10 @@ def drawn_reward(path, columns, hidden=(15,), scene_gating=False, seed=3):
     lower, upper = (
         np.array([getattr(s, n) for s in specs]) for n in ("lower", "upper")
     )
-    made: RewardWeights = dataclasses.replace(
+    made = dataclasses.replace(
         drawn,
         preset=columns.preset,
-        features=tuple(
-            FeatureSpec(name=s.name, unit=s.unit, none_value=s.none) for s in specs
-        ),
+        **columns_of(specs),
         lower=lower,
         upper=upper,
         training_range=np.stack([lower, upper]),

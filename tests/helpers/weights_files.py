@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.export import FeatureSpec, PriorCost, RewardWeights, pack, reader, save
+from rcirl_jax.export import PriorCost, Reward, pack, reader, save
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import (
     RewardConfig,
@@ -43,12 +43,11 @@ def example_weights(
     rng = np.random.default_rng(seed)
     sizes = (features, *hidden, 1)
     draw = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
-    return RewardWeights(
+    return Reward(
         preset="test",
-        features=tuple(
-            FeatureSpec(name=f"feature{i}", unit=unit, none_value=10 * i)
-            for i, unit in enumerate(["m", *["m/s²"] * (features - 1)])
-        ),
+        names=tuple(f"feature{i}" for i in range(features)),
+        units=("m", *["m/s²"] * (features - 1)),
+        none_values=tuple(10 * i for i in range(features)),
         lower=-1.0 - rng.random(features, np.float32),
         upper=1.0 + rng.random(features, np.float32),
         location=draw(features),
@@ -85,7 +84,7 @@ def example_prior_cost(seed=0, features=3, units=4):
 def example_samples(weights, count=4, seed=1):
     """Features that often leave [lower, upper], masks, float64 values."""
     rng = np.random.default_rng(seed)
-    size = (count, len(weights.times), len(weights.features))
+    size = (count, len(weights.times), len(weights.names))
     features = rng.normal(scale=2.0, size=size).astype(np.float32)
     valid = rng.random(size[:2]) < 0.7
     valid[:, 0] |= weights.scene_gating is not None or weights.prior_cost is not None
@@ -149,14 +148,17 @@ LOWER = np.array([spec.lower for spec in SPECS], np.float32)
 UPPER = np.array([spec.upper for spec in SPECS], np.float32)
 
 
+def columns_of(specs):
+    """The fields of a reward that name its columns."""
+    keys = {"names": "name", "units": "unit", "none_values": "none"}
+    return {k: tuple(getattr(s, key) for s in specs) for k, key in keys.items()}
+
+
 def of_the_preset(made, **changes):
     """Weights that read the features of the paper's preset at the usual times."""
-    features = tuple(
-        FeatureSpec(name=s.name, unit=s.unit, none_value=s.none) for s in SPECS
-    )
     own = {"preset": "paper21", "times": TIMES_S, "leaky_slope": LEAKY_SLOPE}
-    own |= {"lower": LOWER, "upper": UPPER, "features": features}
-    own["training_range"] = np.stack([LOWER, UPPER])
+    own |= {"lower": LOWER, "upper": UPPER, "training_range": np.stack([LOWER, UPPER])}
+    own |= columns_of(SPECS)
     return dataclasses.replace(made, **{**own, **changes})
 
 

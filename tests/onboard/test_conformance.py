@@ -13,7 +13,7 @@ import pytest
 from onboard.conformance import check, make
 from rcirl_jax.export import load_weights
 from rcirl_jax.export.own_planner import features
-from rcirl_jax.export.own_planner.plain import plain_scene
+from rcirl_jax.export.own_planner.builder import plain_scene
 from rcirl_jax.features import columns as f
 from rcirl_jax.units import NUM_TIMES
 from tests.helpers.own_planner import TOLERANCE, entries, error, numpy_answers

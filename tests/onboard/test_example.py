@@ -13,7 +13,7 @@ import pytest
 from rcirl_jax import Body, Car, CentreLine, load_weights, scene_from
 from rcirl_jax.export import reader
 from rcirl_jax.export.own_planner import features
-from rcirl_jax.export.own_planner.plain import plain_scene
+from rcirl_jax.export.own_planner.builder import plain_scene
 from rcirl_jax.features import columns
 from tests.export.test_weights import golden
 from tests.helpers.own_planner import TOLERANCE, error, numpy_answers
@@ -127,9 +127,3 @@ def test_choose_adds_a_reward_with_a_prior_cost_to_the_costs(tmp_path):
         done = said(*arguments)
         assert done.returncode == 2
         assert wanted in done.stderr.decode()
-
-
-def test_the_programs_are_short():
-    for name in ("own_planner.py", "own_planner.cpp"):
-        lines = (ONBOARD / "example" / name).read_text().splitlines()
-        assert len(lines) <= 60

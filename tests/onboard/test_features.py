@@ -9,7 +9,7 @@ import pytest
 from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.scenes.collect import Collector, stack_scenes
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.export.own_planner.plain import plain_scene
+from rcirl_jax.export.own_planner.builder import plain_scene
 from tests.helpers import drawn_scenes
 from tests.helpers.own_planner import (
     TOLERANCE,

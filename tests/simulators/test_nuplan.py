@@ -38,7 +38,7 @@ def road():
 def weights(tmp_path_factory):
     """A reward that likes speed and nothing else."""
     made = of_the_preset(example_weights(0, 21, TIMES_S.size, (), "identity"))
-    liked = np.array([[f.name == "velocity"] for f in made.features], np.float32)
+    liked = np.array([[name == "velocity"] for name in made.names], np.float32)
     made = dataclasses.replace(
         made, kernels=(liked,), biases=(np.zeros(1),), gamma=np.ones(TIMES_S.size)
     )

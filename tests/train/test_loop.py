@@ -18,7 +18,7 @@ from rcirl_jax.evaluation.ranking.evaluate import (
     oracle_floor,
 )
 from rcirl_jax.evaluation.ranking.learners import FrozenSets, train_learner
-from rcirl_jax.export.forms.stablehlo import exported_run
+from rcirl_jax.export.forms import exported_run
 from rcirl_jax.export.from_run import export_run, read_config, verification_samples
 from rcirl_jax.export.loading import load_runs
 from rcirl_jax.features import feature_map

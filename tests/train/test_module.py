@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.export.forms.stablehlo import exported_module, write_stablehlo
+from rcirl_jax.export.forms import exported_module, write_stablehlo
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.rank import RankConfig, module_score, rank_policy
 from rcirl_jax.reward import RewardConfig, RewardModel, value

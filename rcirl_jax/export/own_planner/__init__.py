@@ -1,6 +1,6 @@
-"""For planners of other people: F from plain numbers, scenes from metres, conformance.
+"""For planners of other people: F from plain numbers, scenes from metres.
 
-`features.py` (numpy only, may be copied alone) is F; `builder.py` makes scenes from
-Cartesian input; `conformance.py` writes what other implementations are held against.
-The same in C++: `onboard/`. For users: docs/own_planner.md.
+`features.py` has the plain structs and F of them (numpy only; copied together with
+`rcirl_jax/features/columns.py`); `inputs.py` what people measure; `builder.py` makes
+scenes of it. The same in C++: `onboard/`. For users: docs/own_planner.md.
 """
