@@ -141,11 +141,6 @@ def test_layout_is_the_documented_one():
     assert full["scene_gating"]["shape"] == [3, 3]
     assert tuple(full["prior_cost"]) == tuple(reader.BODY["prior_cost"][0])
     assert tuple(full["prior_cost"]["familiarity"]) == tuple(reader.FAMILIARITY)
-    kernel = body["layers"][0]["kernel"]
-    assert (kernel["shape"], kernel["dtype"]) == ([3, 5], "<f4")
-    weights = example_weights()
-    found = np.frombuffer(kernel["data"], "<f4").reshape(3, 5)
-    np.testing.assert_array_equal(found, weights.kernels[0])
 
 
 @pytest.mark.parametrize("scene_gating", [False, True])
@@ -204,18 +199,10 @@ def test_schema_describes_the_body_and_refuses_others():
             == tuple(keys)
         )
     assert found["activation"]["enum"] == sorted(ACTIVATIONS)
-
-    def less(made, key):
-        return {k: v for k, v in made.items() if k != key}
-
     wrong = [{**plain, "extra": 1}, {**full, "scene_gating": full["gamma"]}]
     wrong.append({**plain, "gamma": {**plain["gamma"], "dtype": "<f8"}})
-    for key in tuple(reader.BODY):
-        wrong += [less(full, key), {**full, key: True}]
-    box = full["prior_cost"]
-    for key in tuple(reader.BODY["prior_cost"][0]):
-        others = (less(box, key), {**box, key: True}, {**box, "extra": 1})
-        wrong += [{**full, "prior_cost": other} for other in others]
+    for key in reader.BODY:
+        wrong += [{k: v for k, v in full.items() if k != key}, {**full, key: True}]
     assert not any(map(validator.is_valid, wrong))
 
 

@@ -159,8 +159,6 @@ def test_a_thousand_plans_get_the_guard_of_python(programs, tmp_path, data):
 def test_choose_takes_the_best_candidate_that_has_a_value(programs, tmp_path):
     path, missing = tmp_path / "weights.msgpack", tmp_path / "missing"
     path.write_bytes(VALID)
-    with_prior = tmp_path / "with_prior"
-    with_prior.write_bytes(WITH_PRIOR)
     reward = load_weights(path)
     features = np.random.default_rng(0).normal(size=(50, 3, 2)).astype(np.float32)
     order = np.argsort(reward.value(features))
@@ -176,13 +174,6 @@ def test_choose_takes_the_best_candidate_that_has_a_value(programs, tmp_path):
     for file, data, message, code in (
         (path, features[:1].tobytes()[4:], "stdin: candidates: 5 numbers: expected", 2),
         (path, np.full(6, np.nan, "f4").tobytes(), "stdin: candidates: all 1 ref", 1),
-        # a reward that is added to the cost of a planner, whose costs are missing
-        (
-            with_prior,
-            b"",
-            f"{with_prior}: prior_cost: hand-set: expected COSTS as a second",
-            2,
-        ),
         (missing, b"", f"{python.value}\n", 2),
     ):
         done = subprocess.run(
