@@ -313,8 +313,13 @@ CAPS_M = {
 
 
 def _larger(a: Array | float, b: Array) -> Array:
-    """One instruction where `xp.maximum` takes four; NaN where b is."""
-    return namespace(b).where(a > b, a, b)
+    """Return the larger; NaN where b is. XLA compares once where `maximum` takes four."""
+    return np.maximum(a, b) if namespace(b) is np else namespace(b).where(a > b, a, b)
+
+
+def _smaller(a: Array, b: Array) -> Array:
+    """Return the smaller, as `_larger`."""
+    return np.minimum(a, b) if namespace(b) is np else namespace(b).where(a < b, a, b)
 
 
 def _gaps(o: Slot, s: Array, l: Array) -> tuple[Array, Array]:
@@ -354,15 +359,18 @@ def _nearest(
     from_ego = {"overtake": -s, "sidepass_rear": -s, "nudge": xp.zeros_like(s)}
     found = {}
     for name, cap in CAPS_M.items():
+        members = [
+            (*classes[name], o.speed) for o, classes in zip(ego_slots, met, strict=True)
+        ]
+        if xp is np:  # XLA cannot see, numpy can, that an obstacle is in few classes
+            members = [x for x in members if (x[0] & (x[1] < FAR_M)).any()]
         edge = speed = xp.full_like(s, FAR_M)
-        for classes in met:
-            member, key = classes[name]
+        for member, key, _ in members:
             key = xp.where(member, key, FAR_M)
-            edge = xp.where(edge < key, edge, key)  # no member's is NaN
-        for o, classes in zip(ego_slots, met, strict=True):
-            member, key = classes[name]
-            slower = member & (key == edge) & (o.speed < speed)
-            speed = xp.where(slower, o.speed, speed)
+            edge = _smaller(edge, key)  # no member's is NaN
+        for member, key, its_speed in members:
+            slower = member & (key == edge) & (its_speed < speed)
+            speed = xp.where(slower, its_speed, speed)
         distance = edge - from_ego.get(name, s)
         known = distance < cap
         # none is found where compiled code rounds a key differently in each loop
