@@ -313,7 +313,7 @@ CAPS_M = {
 
 
 def _larger(a: Array | float, b: Array) -> Array:
-    """Return the larger; NaN where b is. XLA compares once where `maximum` takes four."""
+    """Return the larger; NaN where b is. XLA compares once, `maximum` four times."""
     return np.maximum(a, b) if namespace(b) is np else namespace(b).where(a > b, a, b)
 
 
