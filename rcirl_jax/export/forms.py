@@ -25,7 +25,7 @@ reward has none: it wants more of a feature or less, never the usual.
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -161,7 +161,7 @@ def write_onnx(path: Path, reward: Reward) -> None:
         constants.append(made)
         return name
 
-    def node(kind: str, *inputs: str, result: str = "", **attributes: object) -> str:
+    def node(kind: str, *inputs: str, result: str = "", **attributes: Any) -> str:  # noqa: ANN401
         name = result or f"{kind.lower()}_{len(nodes)}"
         nodes.append(helper.make_node(kind, list(inputs), [name], **attributes))
         return name
@@ -173,8 +173,8 @@ def write_onnx(path: Path, reward: Reward) -> None:
         first = node("Gather", x, constant("first", [0], np.int64), axis=1)
         product = node("MatMul", first, constant("context", reward.scene_gating))
         x = node("Mul", x, node("Mul", node("Sigmoid", product), constant("two", 2.0)))
-    slope = reward.leaky_slope
-    own = {"alpha": float(slope)} if reward.activation == "leaky_relu" else {}
+    slope = float(reward.leaky_slope)
+    own: dict[str, Any] = {"alpha": slope} if reward.activation == "leaky_relu" else {}
     for i, (kernel, bias) in enumerate(zip(reward.kernels, reward.biases, strict=True)):
         x = node("MatMul", x, constant(f"kernel_{i}", kernel))
         x = node("Add", x, constant(f"bias_{i}", bias))
