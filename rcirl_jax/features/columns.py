@@ -53,7 +53,8 @@ STATION_STEP_M = 2.0  # m between points of the station grid
 
 def namespace(*arrays: Array) -> Any:  # noqa: ANN401
     """Return numpy where all arrays are numpy's, else jax.numpy."""
-    others = (x for x in arrays if not isinstance(x, np.ndarray | np.generic))
+    numpy = np.ndarray | np.generic | float
+    others = (x for x in arrays if not isinstance(x, numpy))
     other = next(others, None)
     return np if other is None else other.__array_namespace__()
 
@@ -268,7 +269,7 @@ class Slot(NamedTuple):
 
 def slots(ego: Ego, obstacles: Obstacles) -> tuple[Slot, ...]:
     """The N obstacles as Slots with leaves [T]."""
-    xp = namespace(obstacles.s_lower)
+    xp = namespace(obstacles.s_lower, ego.length)
     half_length, half_width = 0.5 * ego.length, 0.5 * ego.width
     kind = obstacles.kind[:, None]
     body = obstacles.valid & (kind >= Kind.VEHICLE) & (kind <= Kind.STATIC)
