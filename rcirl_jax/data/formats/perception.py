@@ -175,55 +175,40 @@ def tracks_of(
     for _, rows in split_tracks(path, boxes.ids, boxes.t, max_gap_s):
         name = boxes.names[int(boxes.ids[rows[0]])]
         seen[name] = seen.get(name, 0) + 1
-        label = name if seen[name] == 1 else f"{name}#{seen[name]}"
-        track = _track(label, boxes, rows, unknown, automated)
-        dropped += track is None
-        tracks += [] if track is None else [track]
+        t, x, y, speed = boxes.t[rows], boxes.x[rows], boxes.y[rows], boxes.speed[rows]
+        # most frequent class; the shift makes UNKNOWN a count of its own
+        kind = int(np.argmax(np.bincount(boxes.kind[rows] - UNKNOWN))) + UNKNOWN
+        size, assumed = [], boxes.size_assumed
+        usual = SIZES_M.get(Kind(max(kind, 0)), OTHER_SIZE_M)
+        for sizes, default in zip((boxes.length, boxes.width), usual, strict=True):
+            known = sizes[rows][np.isfinite(sizes[rows])]
+            size.append(float(np.median(known)) if known.size else default)
+            assumed |= not known.size
+        if kind == UNKNOWN and unknown == "drop":
+            dropped += 1
+            continue
+        if kind == UNKNOWN:
+            moved = np.hypot(np.ptp(x), np.ptp(y)) > STANDING_M
+            by_motion = "vehicle" if moved else "static"
+            kind = Kind[(by_motion if unknown == "auto" else unknown).upper()]
+        lost = ~np.isfinite(speed)
+        track = Track(
+            id=name if seen[name] == 1 else f"{name}#{seen[name]}",
+            kind=Kind(kind),
+            length=max(size[0], LENGTH_RANGE_M[0]),
+            width=max(size[1], WIDTH_RANGE_M[0]),
+            size_assumed=assumed,
+            t=t,
+            x=x,
+            y=y,
+            heading=boxes.heading[rows],
+            speed=np.where(lost, speed_of(t, x, y), speed) if lost.any() else speed,
+            automated=automated,
+        )
+        tracks.append(track)
     tracks, outliers = without_outliers(tracks)
-    lost = [f"{dropped} tracks of unknown class left out"] if dropped else []
-    return tracks, [*notes, *outliers, *lost]
-
-
-def _track(
-    name: str,
-    boxes: Boxes,
-    rows: np.ndarray,
-    unknown: str,
-    automated: tuple[tuple[float, float], ...],
-) -> Track | None:
-    """One track, or None where its class is unknown and such are dropped."""
-    t, x, y = boxes.t[rows], boxes.x[rows], boxes.y[rows]
-    # most frequent class; the shift makes UNKNOWN a count of its own
-    kind = int(np.argmax(np.bincount(boxes.kind[rows] - UNKNOWN))) + UNKNOWN
-    size, assumed = [], boxes.size_assumed
-    usual = SIZES_M.get(Kind(max(kind, 0)), OTHER_SIZE_M)
-    for sizes, default in zip((boxes.length, boxes.width), usual, strict=True):
-        known = sizes[rows][np.isfinite(sizes[rows])]
-        size.append(float(np.median(known)) if known.size else default)
-        assumed |= not known.size
-    if kind == UNKNOWN:
-        if unknown == "drop":
-            return None
-        moved = np.hypot(np.ptp(x), np.ptp(y)) > STANDING_M
-        choice = ("vehicle" if moved else "static") if unknown == "auto" else unknown
-        kind = int(Kind[choice.upper()])
-    speed = boxes.speed[rows]
-    lost = ~np.isfinite(speed)
-    if lost.any():
-        speed = np.where(lost, speed_of(t, x, y), speed)
-    return Track(
-        id=name,
-        kind=Kind(kind),
-        length=max(size[0], LENGTH_RANGE_M[0]),
-        width=max(size[1], WIDTH_RANGE_M[0]),
-        size_assumed=assumed,
-        t=t,
-        x=x,
-        y=y,
-        heading=boxes.heading[rows],
-        speed=speed,
-        automated=automated,
-    )
+    left_out = [f"{dropped} tracks of unknown class left out"] if dropped else []
+    return tracks, [*notes, *outliers, *left_out]
 
 
 def speed_of(t: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -49,9 +49,9 @@ class Run:
     """
 
     def __init__(self, first: Path) -> None:
-        drive, number = _drive_and_part(first)
         match = NAME.fullmatch(first.name)
         is_part = match is not None and match["part"] is not None
+        drive, number = _drive_and_part(first)
         beside = first.parent.glob("*.record.*") if is_part else ()
         known = _drives(beside).get(drive, {})
         self.first, self.drive, self.files = first, drive.name, [first]
@@ -66,24 +66,19 @@ class Run:
 
 def first_parts(folder: Path, pattern: str) -> list[Path]:
     """Lists the first file of each run of parts at any depth of a folder, sorted."""
-    drives = _drives(files_below(folder, pattern))
-    if not drives:
+    drives = _drives(files_below(folder, pattern)).values()
+    firsts = [f for parts in drives for n, f in parts.items() if n - 1 not in parts]
+    if not firsts:
         raise InputError(f"{folder}: no file matches {pattern}: expected cyber records")
-    return sorted(
-        file
-        for parts in drives.values()
-        for number, file in parts.items()
-        if number - 1 not in parts
-    )
+    return sorted(firsts)
 
 
 def _drives(files: Iterable[Path]) -> dict[Path, dict[int, Path]]:
     """Parts by drive and number; of a file and its copies the shortest name counts."""
     drives: dict[Path, dict[int, Path]] = {}
-    for file in sorted(files):
-        if NAME.fullmatch(file.name):
-            drive, number = _drive_and_part(file)
-            drives.setdefault(drive, {}).setdefault(number, file)
+    for file in filter(lambda one: NAME.fullmatch(one.name), sorted(files)):
+        drive, number = _drive_and_part(file)
+        drives.setdefault(drive, {}).setdefault(number, file)
     return drives
 
 

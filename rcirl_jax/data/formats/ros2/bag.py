@@ -10,6 +10,7 @@ file; SQLite files from before ROS 2 Iron lack them.
 
 import contextlib
 import io
+import itertools
 import re
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
@@ -30,10 +31,9 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 MAX_METADATA_BYTES = 64 * 2**20  # bytes; rosbag2 repeats the profiles of each topic
 MAX_MESSAGE_BYTES = 16 * 2**20  # bytes; decoded, a message takes many times its bytes
 MAX_CHUNK_BYTES = 2**30  # bytes of one chunk of MCAP, unpacked or not
-MAX_SCHEMA_BYTES = 2**20  # bytes of a message's definition; the longest have 50 kB
 MAX_TOPICS = 100_000
 MAX_MESSAGES = 100_000_000
-TOPICS = ("id", "name", "type", "serialization_format")
+TOPICS = ("name", "type", "serialization_format")
 MESSAGES = ("topic_id", "timestamp", "data")
 DEFINITIONS = ("topic_type", "encoding", "encoded_message_definition")
 
@@ -199,51 +199,40 @@ def _of_mcap(path: Path, stream: BinaryIO) -> BagFile:
 def _of_sqlite(database: Database) -> BagFile:
     database.need("messages", MESSAGES)
 
-    def texts(table: str, columns: tuple[str, ...]) -> list[tuple]:
-        """Rows of a table of texts, but for the column id."""
-        rows = database.table(table, columns, MAX_TOPICS)
-        for row in rows:
-            for name, cell in zip(columns, row, strict=True):
-                if name != "id" and not isinstance(cell, str):
-                    raise database.error(f"{table}.{name}", repr(cell)[:40], "a text")
-        return rows
+    def rows(sql: str, most: int = MAX_TOPICS, values: tuple = ()) -> Iterator[tuple]:
+        chunks = database.chunks(sql, ("messages",), most, values)
+        return itertools.chain.from_iterable(chunks)
 
-    def ints(sql: str) -> list[int]:
-        found = database.chunks(sql, ("messages",), MAX_TOPICS)
-        return [row[0] for rows in found for row in rows if isinstance(row[0], int)]
+    def texts(table: str, columns: tuple[str, ...]) -> list[tuple]:
+        """Rows of a table: its id, and texts."""
+        database.need(table, ("id", *columns))
+        cast = ", ".join(f"CAST({name} AS TEXT)" for name in columns)
+        found = rows(f"SELECT id, {cast} FROM {table}")
+        return [(key, *(cell or "" for cell in cells)) for key, *cells in found]
 
     named = texts("topics", TOPICS)
     has_definitions = database.columns("message_definitions")
-    rows = texts("message_definitions", DEFINITIONS) if has_definitions else ()
-    definitions = {kind: (encoding, text.encode()) for kind, encoding, text in rows}
-    used = {*ints("SELECT DISTINCT topic_id FROM messages")}
+    known = texts("message_definitions", DEFINITIONS) if has_definitions else ()
+    definitions = {kind: (encoding, text.encode()) for _, kind, encoding, text in known}
+    used = {key for (key,) in rows("SELECT DISTINCT topic_id FROM messages")}
     topics = {
         name: Topic(kind, encoding, *definitions.get(kind, ("", b"")), key not in used)
         for key, name, kind, encoding in named
     }
     by_time = "SELECT timestamp FROM messages ORDER BY timestamp"
-    ends = [*ints(f"{by_time} LIMIT 1"), *ints(f"{by_time} DESC LIMIT 1")]
+    ends = f"CAST(({by_time} LIMIT 1) AS INT), CAST(({by_time} DESC LIMIT 1) AS INT)"
 
     def messages(wanted: Collection[str]) -> Iterator[Sent]:
         names = {key: name for key, name, *_ in named if name in wanted}
         sql = (
-            "SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN "
-            f"({', '.join('?' * len(names))}) ORDER BY timestamp"
+            "SELECT topic_id, CAST(timestamp AS INT), CAST(data AS BLOB) FROM messages "
+            f"WHERE topic_id IN ({', '.join('?' * len(names))}) ORDER BY timestamp"
         )
-        numbers = dict.fromkeys(wanted, 0)
-        for rows in database.chunks(sql, MESSAGES, MAX_MESSAGES, tuple(names)):
-            for key, logged, data in rows:
-                name = names[key]
-                if not isinstance(logged, int) or not isinstance(data, bytes):
-                    raise database.error(
-                        f"messages: message {numbers[name]} of {name}",
-                        f"{type(logged).__name__}, {type(data).__name__}",
-                        "a time in ns and bytes",
-                    )
-                numbers[name] += 1
-                yield name, logged, data
+        for key, logged, data in rows(sql, MAX_MESSAGES, tuple(names)):
+            yield names[key], logged or 0, data or b""
 
-    return BagFile(topics, (ends[0], ends[1]) if len(ends) == 2 else None, messages)
+    ((first, last),) = rows(f"SELECT {ends}")
+    return BagFile(topics, None if first is None else (first, last), messages)
 
 
 # ------------------------------------------------------------------- decoding
@@ -273,8 +262,7 @@ def decoder_of(path: Path, name: str, topic: Topic) -> Callable[[bytes], Message
     Raises:
       InputError: an encoding that is not ROS 2's, or no definition.
     """
-    where, size = f"{path}: {name} ({topic.type})", len(topic.schema)
-    wrong = ""
+    where, wrong = f"{path}: {name} ({topic.type})", ""
     if topic.encoding != "cdr":
         wrong = (
             f"message_encoding: {topic.encoding!r}: expected cdr, which ROS 2 writes; "
@@ -286,8 +274,6 @@ def decoder_of(path: Path, name: str, topic: Topic) -> Callable[[bytes], Message
             "definition inside the file; record it anew with `ros2 bag convert` where "
             "its package is installed"
         )
-    elif size > MAX_SCHEMA_BYTES:
-        wrong = f"schema: {size} bytes: expected at most {MAX_SCHEMA_BYTES}"
     if wrong:
         raise InputError(f"{where}: {wrong}")
     decoders = extra_module("mcap_ros2.decoder", EXTRA)

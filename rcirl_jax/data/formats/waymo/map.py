@@ -59,7 +59,11 @@ def read_map(
     features = scenario.map_features
     steps = scenario.dynamic_map_states
     signals, points, flashing = _signals(where, steps, t, origin, spec)
-    signs = _stop_signs(where, features, origin)
+    signs: dict[int, np.ndarray] = {}  # lane id -> [2] m, the sign that governs it
+    for sign in _by_id(where, features, "stop_sign").values():
+        if sign.HasField("position"):
+            place = _points(where, [sign.position], origin)[0]
+            signs.update(dict.fromkeys(sign.lane, place))
     lanes, notes = _lanes(where, features, {**signs, **points}, origin, spec)
     lit = {signal.id for signal in signals}
     signed = {str(key) for key in signs.keys() | flashing}
@@ -250,18 +254,6 @@ def _of_lanes(
 
 
 # -------------------------------------------------------------------- signals
-
-
-def _stop_signs(
-    where: str, features: Sequence[Message], origin: np.ndarray
-) -> dict[int, np.ndarray]:
-    """Lane id -> position [2] m of the sign that governs it."""
-    signs: dict[int, np.ndarray] = {}
-    for sign in _by_id(where, features, "stop_sign").values():
-        if sign.HasField("position"):
-            point = _points(where, [sign.position], origin)[0]
-            signs.update(dict.fromkeys(sign.lane, point))
-    return signs
 
 
 def _signals(
