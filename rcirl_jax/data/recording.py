@@ -5,6 +5,7 @@ read as m/s, frames read as seconds. Each violation is one line that names the
 file, the field, the value found and what was expected.
 """
 
+import collections
 import dataclasses
 import itertools
 import math
@@ -117,15 +118,13 @@ def validate_recording(
       InputError: the first violation, as "FILE: field: value: expected".
     """
     name = str(file or recording.name)
-    if not (np.isfinite(recording.rate_hz) and recording.rate_hz > 0.0):
-        raise InputError(f"{name}: rate_hz: {recording.rate_hz}: expected > 0")
-    if recording.rate_hz > MAX_RATE_HZ:
-        raise InputError(
-            f"{name}: rate_hz: {recording.rate_hz:g}: expected up to {MAX_RATE_HZ:g}"
-        )
-    if not recording.tracks:
+    rate, tracks = recording.rate_hz, recording.tracks
+    _check(rate > 0.0, name, "rate_hz", rate, "> 0")
+    fits = rate <= MAX_RATE_HZ
+    _check(fits, name, "rate_hz", f"{rate:g}", f"up to {MAX_RATE_HZ:g}")
+    if not tracks:
         return recording  # counted as empty, and skipped
-    tracks, lanes, signals = recording.tracks, recording.lanes, recording.signals
+    lanes, signals = recording.lanes, recording.signals
     texts = {
         "name": recording.name,
         "group": recording.group or "",
@@ -135,35 +134,25 @@ def validate_recording(
         "notes": "".join(recording.notes),
     }
     for field, text in texts.items():
-        if not is_text(text):
-            raise InputError(f"{name}: {field}: {text!a:.80}: expected UTF-8 text")
+        _check(is_text(text), name, field, f"{text!a:.80}", "UTF-8 text")
     for what, parts in (("track", tracks), ("lane", lanes), ("signal", signals)):
-        seen: set[str] = set()
-        for part in parts:
-            if part.id in seen:
-                raise InputError(
-                    f"{name}: {what} id: {part.id}: met twice: expected once"
-                )
-            seen.add(part.id)
+        for number, count in collections.Counter(part.id for part in parts).items():
+            _check(count == 1, name, f"{what} id", f"{number}: met twice", "once")
     for track in tracks:
-        _check_track(name, track)
+        _check_track(f"{name}: track {track.id}", track)
     steps = np.concatenate([np.diff(track.t) for track in tracks])
-    expected = 1.0 / recording.rate_hz
-    step = float(np.median(steps)) if steps.size else expected
-    if abs(step / expected - 1.0) > RATE_TOLERANCE:
-        raise InputError(
-            f"{name}: t: median step {step:g} s: expected {expected:g} s "
-            f"(rate_hz {recording.rate_hz:g})"
-        )
+    step = float(np.median(steps)) * rate if steps.size else 1.0  # in samples
+    _check(
+        abs(step - 1.0) <= RATE_TOLERANCE, name, "t", f"median step {step / rate:g} s",
+        f"{1.0 / rate:g} s (rate_hz {rate:g})",
+    )  # fmt: skip
     begin = min(float(track.t[0]) for track in tracks)
     for signal in signals:
-        _check_signal(name, signal, begin)
+        _check_signal(f"{name}: signal {signal.id}", signal, begin)
     for agent in recording.missing_agents:
         values = (agent.t0, agent.t1, *agent.start, *agent.end)
-        if not np.isfinite(values).all() or agent.t1 < agent.t0:
-            raise InputError(
-                f"{name}: missing agent: {values}: expected finite, t1 >= t0"
-            )
+        good = bool(np.isfinite(values).all()) and agent.t1 >= agent.t0
+        _check(good, name, "missing agent", values, "finite, t1 >= t0")
     lane_ids, signal_ids = {lane.id for lane in lanes}, {x.id for x in signals}
     checked = [_check_lane(name, lane, lane_ids, signal_ids) for lane in lanes]
     for place, axis in enumerate(("x", "y")):
@@ -180,49 +169,47 @@ def validate_recording(
         _check_sizes(name, cars, lanes)
     _check_speeds(name, recording)
     if len(cars) >= MIN_CARS:
-        _check_headings(name, cars, recording.rate_hz)
+        _check_headings(name, cars, rate)
     return dataclasses.replace(recording, lanes=tuple(checked))
 
 
-def _check_track(name: str, track: Track) -> None:
-    where = f"{name}: track {track.id}"
+def _check(good: bool, where: str, field: str, value: object, expected: str) -> None:
+    """Raises the one line of a value that does not hold."""
+    if not good:
+        raise InputError(f"{where}: {field}: {value}: expected {expected}")
+
+
+def _check_track(where: str, track: Track) -> None:
     sizes = sorted({getattr(track, field).shape for field in SERIES})
-    if len(sizes) != 1 or track.t.ndim != 1 or track.t.size == 0:
-        raise InputError(f"{where}: samples: {sizes}: expected equal, at least one")
+    equal = len(sizes) == 1 and track.t.ndim == 1 and track.t.size > 0
+    _check(equal, where, "samples", sizes, "equal, at least one")
     for field in SERIES:
         values = getattr(track, field)
-        bad = np.flatnonzero(~np.isfinite(values))
-        if bad.size:
-            found = values[bad[0]]
-            raise InputError(f"{where}: {field}: {found}: expected a finite number")
-    backwards = np.flatnonzero(np.diff(track.t) <= 0.0)
-    if backwards.size:
-        before, after = track.t[backwards[0]], track.t[backwards[0] + 1]
-        raise InputError(
-            f"{where}: t: {after:g} s after {before:g} s: expected increasing times"
-        )
+        bad = values[~np.isfinite(values)]
+        _check(not bad.size, where, field, bad[:1].sum(), "a finite number")
+    back = int(np.argmin(np.diff(track.t))) if track.t.size > 1 else 0
+    before, after = track.t[back : back + 2] if track.t.size > 1 else (-1.0, 0.0)
+    _check(
+        after > before,
+        where,
+        "t",
+        f"{after:g} s after {before:g} s",
+        "increasing times",
+    )
     place = track.destination
-    if place is not None and not np.isfinite(place).all():
-        raise InputError(f"{where}: destination: {place}: expected finite numbers")
+    known = place is None or bool(np.isfinite(place).all())
+    _check(known, where, "destination", place, "finite numbers")
     for field in ("automated", "leader_missing"):
         for low, high in getattr(track, field):
-            if not low <= high:
-                raise InputError(
-                    f"{where}: {field}: {low} to {high} s: expected a span"
-                )
+            _check(low <= high, where, field, f"{low} to {high} s", "a span")
     static = track.kind == Kind.STATIC
     for field, moving in (("length", LENGTH_RANGE_M), ("width", WIDTH_RANGE_M)):
-        low, high = STATIC_RANGE_M if static else moving
-        size = getattr(track, field)
-        if not low <= size <= high:
-            raise InputError(
-                f"{where}: {field}: {size:g} m: expected {low:g} to {high:g} m"
-            )
-    fastest = float(np.max(np.abs(track.speed)))
-    if fastest > MAX_SPEED_MPS:
-        raise InputError(
-            f"{where}: speed: {fastest:g} m/s: expected below {MAX_SPEED_MPS:g} m/s"
+        (low, high), size = STATIC_RANGE_M if static else moving, getattr(track, field)
+        _check(
+            low <= size <= high, where, field, f"{size:g} m", f"{low:g} to {high:g} m"
         )
+    fast, most = float(np.max(np.abs(track.speed))), MAX_SPEED_MPS
+    _check(fast <= most, where, "speed", f"{fast:g} m/s", f"below {most:g} m/s")
 
 
 def check_span(where: str, field: str, values: np.ndarray) -> None:
@@ -249,49 +236,41 @@ def check_lanes_length(where: str, total: float) -> None:
         )
 
 
-def _check_signal(name: str, signal: Signal, begin: float) -> None:
-    where = f"{name}: signal {signal.id}"
-    if signal.start.size != len(signal.state) or signal.start.size == 0:
-        raise InputError(
-            f"{where}: state: {len(signal.state)} for {signal.start.size} starts: "
-            "expected one each, at least one"
-        )
-    unknown = set(signal.state) - set(STATES)
-    if unknown:
-        raise InputError(f"{where}: state: {min(unknown)}: expected one of {STATES}")
-    if not np.isfinite(signal.start).all() or np.any(np.diff(signal.start) <= 0.0):
-        raise InputError(f"{where}: start: not increasing: expected increasing times")
-    if signal.start[0] > begin:
-        raise InputError(
-            f"{where}: start: {signal.start[0]:g} s: "
-            f"expected at or before the first track, {begin:g} s"
-        )
+def _check_signal(where: str, signal: Signal, begin: float) -> None:
+    start, state = signal.start, signal.state
+    one_each = f"{len(state)} for {start.size} starts"
+    equal = start.size == len(state) > 0
+    _check(equal, where, "state", one_each, "one each, at least one")
+    unknown = set(state) - set(STATES)
+    _check(not unknown, where, "state", min(unknown, default=""), f"one of {STATES}")
+    rises = bool(np.isfinite(start).all() and np.all(np.diff(start) > 0.0))
+    _check(rises, where, "start", "not increasing", "increasing times")
+    early, expected = (
+        bool(start[0] <= begin),
+        f"at or before the first track, {begin:g} s",
+    )
+    _check(early, where, "start", f"{start[0]:g} s", expected)
 
 
 def _check_lane(name: str, lane: Lane, lanes: set[str], signals: set[str]) -> Lane:
-    where = f"{name}: lane {lane.id}"
-    shape = lane.centre.shape
-    if len(shape) != 2 or shape[0] < 2 or shape[1] != 2:
-        raise InputError(f"{where}: centre: {shape}: expected [m >= 2, 2] points")
+    where, shape = f"{name}: lane {lane.id}", lane.centre.shape
+    points = len(shape) == 2 and shape[0] >= 2 and shape[1] == 2
+    _check(points, where, "centre", shape, "[m >= 2, 2] points")
     for field in ("centre", "left_width", "right_width"):
         values = getattr(lane, field)
-        if len(values) != len(lane.centre) or not np.isfinite(values).all():
-            raise InputError(
-                f"{where}: {field}: {values.shape}: expected finite, one per point"
-            )
-    if not np.any(np.diff(lane.centre, axis=0)):
-        raise InputError(f"{where}: centre: all points equal: expected a line")
+        good = len(values) == shape[0] and bool(np.isfinite(values).all())
+        _check(good, where, field, values.shape, "finite, one per point")
+    is_line = bool(np.any(np.diff(lane.centre, axis=0)))
+    _check(is_line, where, "centre", "all points equal", "a line")
     narrow = min(float(lane.left_width.min()), float(lane.right_width.min()))
-    if narrow <= 0.0:
-        raise InputError(f"{where}: width: {narrow:g} m: expected > 0")
-    limit = lane.speed_limit
-    if limit is not None and not 0.0 < limit < MAX_SPEED_MPS:
-        raise InputError(
-            f"{where}: speed_limit: {limit:g} m/s: expected 0 to {MAX_SPEED_MPS:g} m/s"
-        )
-    line = lane.stop_line
-    if line is not None and (line.shape != (2, 2) or not np.isfinite(line).all()):
-        raise InputError(f"{where}: stop_line: {line.shape}: expected two points")
+    _check(narrow > 0.0, where, "width", f"{narrow:g} m", "> 0")
+    limit, most, line = lane.speed_limit, MAX_SPEED_MPS, lane.stop_line
+    if limit is not None:
+        said = f"{limit:g} m/s"
+        _check(0.0 < limit < most, where, "speed_limit", said, f"0 to {most:g} m/s")
+    if line is not None:
+        two = line.shape == (2, 2) and bool(np.isfinite(line).all())
+        _check(two, where, "stop_line", line.shape, "two points")
     return dataclasses.replace(
         lane,
         successors=tuple(s for s in lane.successors if s in lanes),

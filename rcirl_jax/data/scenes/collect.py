@@ -22,8 +22,6 @@ from rcirl_jax.data.scenes.lines import line_obstacles, trusted_signals
 from rcirl_jax.data.scenes.motion import (
     GRID_M,
     Driver,
-    FrameTracks,
-    Motion,
     driver_of,
     given_path,
     human_motion,
@@ -40,7 +38,6 @@ from rcirl_jax.types import (
     Path,
     Recording,
     Scene,
-    Trajectory,
 )
 from rcirl_jax.units import (
     HORIZON_S,
@@ -53,50 +50,59 @@ from rcirl_jax.units import (
 VIEW_BEHIND_M = 60.0  # m, obstacles farther behind are not collected
 MAX_MISSING_POINTS = 1000  # of the line that a missing road user is taken to drive
 VIEW_BESIDE_M = 12.0  # m, obstacles farther beside are not collected
-VIEW_NUMBERS = 7  # float64 of a sample in a frame: s, l, tilt and the table of four
 # m, the scene's station grid and as far beyond it as its speed limits look
 LONG_GRID_M = np.arange(0.0, GRID_M[-1] + LOOK_AHEAD_M + 1e-6, STATION_STEP_M)
-BOX = ("s_lower", "s_upper", "l_lower", "l_upper", "speed", "valid")
+# fields of an obstacle, their value in an empty slot, and their type
+OBSTACLES = {
+    **dict.fromkeys(("s_lower", "s_upper", "l_lower", "l_upper"), (0.0, np.float64)),
+    **dict.fromkeys(("speed", "a", "l_dot"), (0.0, np.float64)),
+    **{"valid": (False, np.bool_), "kind": (0, np.int32)},
+    **{"is_light": (False, np.bool_), "track": (-1, np.int64)},
+}
 LABELLED_AT_ONCE = 64  # scenes
 CHUNK = 512  # scenes per device call; padded, so that it compiles once
 VIEWS_BYTES = 256 * 2**20  # of tracks kept in the frames of chains
 
 
 class Collector:
-    """Cuts one recording into demonstrations; `dropped` counts the reasons."""
+    """Cuts one recording into demonstrations; `dropped` counts the reasons.
+
+    A scene is a row: a dict of arrays and numbers, named as the leaves of a
+    Demonstration ("path.kappa"), and some that only the next steps need.
+    """
 
     def __init__(self, recording: Recording, config: CollectConfig) -> None:
         # without tracks that flicker; `flicker` counts them
         self.recording, self.flicker = steady_tracks(recording, config)
-        recording = self.recording
-        self.config = config
-        self.rate = recording.rate_hz
+        self.config, self.rate = config, recording.rate_hz
         self.tracks = [
             smooth_track(track, self.rate, config.smoothing_s)
-            for track in recording.tracks
+            for track in self.recording.tracks
         ]
-        self.graph = LaneGraph(recording)
+        self.graph = LaneGraph(self.recording)
         self.signals, self.signal_notes = trusted_signals(
-            recording, config.signal_checks
+            self.recording, config.signal_checks
         )
         self.dropped: collections.Counter[str] = collections.Counter()
         # of the scenes: how many end with their surroundings, times recorded, times cut
         self.ended: collections.Counter[str] = collections.Counter()
-        self._views: dict[tuple[str, ...], FrameTracks] = {}
+        # by chain: all samples in its frame, and the missing agents
+        self._views: dict[tuple[str, ...], np.ndarray] = {}
         self._missing_views: dict[tuple[str, ...], list[tuple[np.ndarray, ...]]] = {}
         counts = [track.num_frames for track in self.tracks]
         self._first = np.array([track.first_frame for track in self.tracks])
         self._last = self._first + np.array(counts) - 1
-        self._ends = np.cumsum(counts)[:-1]
-        self._x = np.concatenate([t.x for t in self.tracks] or [[]])
-        self._y = np.concatenate([t.y for t in self.tracks] or [[]])
-        self._heading = np.concatenate([t.heading for t in self.tracks] or [[]])
-        self._offset = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
+        self._offset = np.cumsum([0, *counts])
+        # all samples, track after track
+        self._x, self._y, self._heading = (
+            np.concatenate([getattr(t, name) for t in self.tracks] or [[]])
+            for name in ("x", "y", "heading")
+        )
         self._size = np.array([(t.track.length, t.track.width) for t in self.tracks])
         self._kind = np.array([t.track.kind for t in self.tracks], np.int32)
 
     def own_frames(self, smooth: SmoothTrack) -> slice:
-        """Return the samples of a track that are the recording's own, not surroundings.
+        """Returns the samples of a track that are the recording's, not surroundings.
 
         All of them, unless the recording is a piece of a longer log.
         """
@@ -110,14 +116,14 @@ class Collector:
         return slice(start, min(max(high, start), smooth.num_frames))
 
     def begins_here(self, smooth: SmoothTrack) -> bool:
-        """Whether the log first saw this track inside the recording's own time."""
+        """Returns whether the log first saw a track inside the recording's own time."""
         if self.recording.scenes_within is None:
             return True
         low, high = self.recording.scenes_within
         return low - 1e-6 <= smooth.track.first_seen_s < high - 1e-6
 
     def scenes(self) -> Iterator[dict]:
-        """Yield rows of one scene each, as flat dicts of numpy arrays."""
+        """Yields rows of one scene each, as flat dicts of numpy arrays."""
         rows = itertools.chain.from_iterable(
             self._scenes_of(number, smooth)
             for number, smooth in enumerate(self.tracks)
@@ -128,12 +134,12 @@ class Collector:
             yield from some
 
     def _scenes_of(self, number: int, smooth: SmoothTrack) -> Iterator[dict]:
-        config, rate = self.config, self.rate
+        config, rate, track = self.config, self.rate, smooth.track
         first = int(np.ceil(config.min_history_s * rate))
         last = smooth.num_frames - 1 - int(np.ceil(config.min_future_s * rate))
         stride = max(int(round(config.stride_s * rate)), 1)
         # frames of the track before this piece of the log
-        before = smooth.first_frame - int(round(smooth.track.first_seen_s * rate))
+        before = smooth.first_frame - int(round(track.first_seen_s * rate))
         starts = np.arange(first, last + 1 + before, stride) - before
         if starts.size == 0:
             self.dropped["future_too_short"] += self.begins_here(smooth)
@@ -145,77 +151,85 @@ class Collector:
         lane_ids = self.graph.match(smooth.x, smooth.y, smooth.heading)
         visited = collections.Counter(lane_ids[lane_ids != ""].tolist())
         driven: dict[str, tuple[LaneFrame, Driver]] = {}  # by the lane of the start
-        for start in starts:
-            lane = str(lane_ids[start])
-            if lane == "":
-                self.dropped["off_map"] += 1
-                continue
-            now, track = (smooth.first_frame + start) / rate, smooth.track
+        for start in starts.tolist():
+            lane, now = str(lane_ids[start]), (smooth.first_frame + start) / rate
             end = min(now + HORIZON_S, float(track.t[-1]))
-            if not track.is_human(now - config.min_history_s, end):
-                self.dropped["not_human"] += 1
-                continue
-            if lane not in driven:
-                frame = self.graph.frame(self.graph.chain(lane, visited))
-                driven[lane] = frame, driver_of(self.view(frame), number, rate)
-            row = self._scene(number, int(start), *driven[lane])
+            if lane == "":
+                row = "off_map"
+            elif not track.is_human(now - config.min_history_s, end):
+                row = "not_human"
+            else:
+                if lane not in driven:
+                    frame = self.graph.frame(self.graph.chain(lane, visited))
+                    samples = slice(self._offset[number], self._offset[number + 1])
+                    s, l = self._view(frame)[samples, :2].T.copy()
+                    driven[lane] = frame, driver_of(s, l, rate)
+                row = self._scene(number, start, *driven[lane])
             if isinstance(row, str):
                 self.dropped[row] += 1
-            else:
-                # times of the recorded future, and those of them without mask
-                times = int(np.sum(row["future_s"] + 1e-6 >= TIMES_S))
-                cut = times - int(np.sum(row["time_valid"]))
-                self.ended.update(shortened=int(cut > 0), times=times, times_cut=cut)
-                yield row
+                continue
+            # times of the recorded future, and those of them without mask
+            times = int(np.sum(row["future_s"] + 1e-6 >= TIMES_S))
+            cut = times - int(np.sum(row["time_valid"]))
+            self.ended.update(shortened=int(cut > 0), times=times, times_cut=cut)
+            yield row
 
-    def view(self, frame: LaneFrame) -> FrameTracks:
-        """All tracks in the chain's frame (cached for the chains last asked for)."""
+    def _view(self, frame: LaneFrame) -> np.ndarray:
+        """Returns all samples in the chain's frame, cached for the last chains.
+
+        Station m, offset m, tilt rad (heading minus the line's, unwrapped) and speed
+        along the line m/s, [samples, 4].
+        """
         if frame.chain in self._views:
             self._views[frame.chain] = self._views.pop(frame.chain)
-        else:
-            each = VIEW_NUMBERS * 8 * max(self._x.size, 1)
-            while len(self._views) >= max(VIEWS_BYTES // each, 1):
-                self._views.pop(next(iter(self._views)))
-            s, l = project(frame, self._x, self._y)
-            tilt = self._heading - frame.on_grid("heading", s)
-            split_s, rate = np.split(s, self._ends), self.rate
-            speeds = [
-                np.gradient(one) * rate if one.size > 1 else 0.0 * one
-                for one in split_s
-            ]
-            tilts = [np.unwrap(one) for one in np.split(tilt, self._ends)]
-            columns = (s, l, np.concatenate(tilts), np.concatenate(speeds))
-            self._views[frame.chain] = FrameTracks(
-                s=split_s,
-                l=np.split(l, self._ends),
-                tilt=tilts,
-                table=np.stack(columns, axis=1),
-            )
-        return self._views[frame.chain]
+            return self._views[frame.chain]
+        s, l = project(frame, self._x, self._y)
+        tilt, speed = self._heading - frame.on_grid("heading", s), 0.0 * s
+        for start, end in itertools.pairwise(self._offset.tolist()):
+            tilt[start:end] = np.unwrap(tilt[start:end])
+            if end - start > 1:
+                speed[start:end] = np.gradient(s[start:end]) * self.rate
+        table = np.stack([s, l, tilt, speed], axis=1)
+        while len(self._views) >= max(VIEWS_BYTES // max(table.nbytes, 1), 1):
+            self._views.pop(next(iter(self._views)))
+        self._views[frame.chain] = table
+        return table
 
     def _scene(
         self, number: int, start: int, frame: LaneFrame, driver: Driver
     ) -> dict | str:
-        """Return one scene, or the reason why there is none."""
-        motion = human_motion(driver, start, frame.length)
-        if motion is None:
+        """Returns one scene, or the reason why there is none."""
+        row = human_motion(driver, start, frame.length)
+        if row is None:
             return "off_map"
-        row = self._ego_and_path(number, start, frame, driver, motion)
-        if reason := filters.reject_motion(row, motion, self.config):
+        smooth = self.tracks[number]
+        row |= {"track": number, "frame": smooth.first_frame + start}
+        row |= {"ego.length": smooth.track.length, "ego.width": smooth.track.width}
+        path_l = given_path(driver, start, row["s0"], frame.length, LONG_GRID_M)
+        stations, far = row["s0"] + GRID_M, row["s0"] + LONG_GRID_M
+        row["path.kappa"], row["path.l"] = (
+            frame.on_grid("kappa", stations),
+            path_l[:NUM_STATIONS],
+        )
+        for name in ("lane_left", "lane_right", "road_left", "road_right"):
+            row[f"path.{name}"] = frame.table(name, stations)
+        row["path.speed_limit"] = planning_limit(
+            frame.on_grid("kappa", far),
+            path_l,
+            frame.table("speed_limit", far),
+            STATION_STEP_M,
+        )[:NUM_STATIONS]
+        if reason := filters.reject_motion(row, self.config):
             return reason
-        self._add_obstacles(row, number, start, frame, motion)
-        if reason := self._end(row, number, motion):
+        self._add_obstacles(row, frame)
+        if reason := self._end(row):
             return reason
-        missing = self._missing(frame, start, number)
-        if reason := filters.reject(row, motion, self.config, missing):
-            return reason
-        return row
+        return filters.reject(row, self.config, self._missing(row, frame)) or row
 
-    def _end(self, row: dict, number: int, motion: Motion) -> str | None:
-        """End the mask where the surroundings end; or the reason to drop the scene."""
-        now = row["frame"] / self.rate
-        track, end = self.tracks[number].track, np.inf
-        for begin, until in track.leader_missing:
+    def _end(self, row: dict) -> str | None:
+        """Ends the mask where the surroundings end; returns a reason to drop it."""
+        now, end = row["frame"] / self.rate, np.inf
+        for begin, until in self.tracks[row["track"]].track.leader_missing:
             if begin <= now + 1e-6 < until:
                 return "follows_missing_car"
             if begin > now:
@@ -228,145 +242,106 @@ class Collector:
         if end < self.config.min_surroundings_s:
             return "surroundings_end"
         row["time_valid"] = row["time_valid"] & (end + 1e-6 >= TIMES_S)
-        return filters.reject_motion(row, motion, self.config)
+        return filters.reject_motion(row, self.config)
 
-    def _ego_and_path(
-        self,
-        number: int,
-        start: int,
-        frame: LaneFrame,
-        driver: Driver,
-        motion: Motion,
-    ) -> dict:
-        smooth = self.tracks[number]
-        stations = motion.s0 + GRID_M
-        path_l = given_path(driver, start, motion.s0, frame.length, LONG_GRID_M)
-        row = {
-            "ego.s": 0.0,
-            "ego.l": motion.l[0],
-            "ego.dl": motion.dl0,
-            "ego.ddl": 0.0,
-            "ego.v": motion.v0,
-            "ego.a": motion.a0,
-            "ego.length": smooth.track.length,
-            "ego.width": smooth.track.width,
-            "path.kappa": frame.on_grid("kappa", stations),
-            "path.l": path_l[:NUM_STATIONS],
-            "time_valid": motion.future_s + 1e-6 >= TIMES_S,
-            "human.s": motion.s,
-            "human.l": motion.l,
-            "future_s": motion.future_s,
-            "s_at_5s": motion.s_at_5s,
-            "track": number,
-            "frame": smooth.first_frame + start,
-        }
-        for name in ("lane_left", "lane_right", "road_left", "road_right"):
-            row[f"path.{name}"] = frame.table(name, stations)
-        far = motion.s0 + LONG_GRID_M
-        limit = planning_limit(
-            frame.on_grid("kappa", far),
-            path_l,
-            frame.table("speed_limit", far),
-            STATION_STEP_M,
-        )
-        row["path.speed_limit"] = limit[:NUM_STATIONS]
-        return row
+    def _add_obstacles(self, row: dict, frame: LaneFrame) -> None:
+        """Adds stop lines, the destination and the nearest others as boxes.
 
-    def _add_obstacles(
-        self, row: dict, number: int, start: int, frame: LaneFrame, motion: Motion
-    ) -> None:
-        """Boxes of everybody else, stop lines and the destination; nearest N."""
-        smooth = self.tracks[number]
-        clock = (smooth.first_frame + start) / self.rate + TIMES_S.astype(np.float64)
+        For the labels and their check only: "obstacles.is_light", a light demands the
+        stop; "obstacles.track", whose box it is (-1: nobody's); "num_bodies" in view.
+        """
+        number = row["track"]
+        clock = row["frame"] / self.rate + TIMES_S.astype(np.float64)
         seen = (self._first <= clock[-1] * self.rate) & (
             self._last >= clock[0] * self.rate
         )
         seen[number] = False
-        lines = line_obstacles(frame, smooth.track, self.signals, clock, motion)
-        room = NUM_OBSTACLES - len(lines)
-        others = np.flatnonzero(seen)
-        near, boxes = self._boxes(row, self.view(frame), others, clock, motion, room)
-        end = len(lines) + min(len(near), room)
-        for name in BOX:
-            table = np.zeros((NUM_OBSTACLES, TIMES_S.size), boxes[name].dtype)
+        lines = line_obstacles(
+            frame, self.tracks[number].track, self.signals, row, clock
+        )
+        near, boxes = self._boxes(
+            row,
+            self._view(frame),
+            np.flatnonzero(seen),
+            clock,
+            NUM_OBSTACLES - len(lines),
+        )
+        for name, (rest, dtype) in OBSTACLES.items():
+            of = boxes.get(name, np.zeros(len(boxes["track"])))
+            made = np.full((NUM_OBSTACLES, *of.shape[1:]), rest, dtype)
             for slot, line in enumerate(lines):
-                table[slot] = line[name]
-            table[len(lines) : end] = boxes[name]
-            row[f"obstacles.{name}"] = table
-        kind = np.zeros(NUM_OBSTACLES, np.int32)
-        kind[: len(lines)] = [line["kind"] for line in lines]
-        kind[len(lines) : end] = self._kind[near[:room]]
-        row["obstacles.kind"] = kind
-        for name in ("a", "l_dot"):
-            row[f"obstacles.{name}"] = np.zeros(NUM_OBSTACLES)
-            row[f"obstacles.{name}"][len(lines) : end] = boxes[name]
-        # for the labels only: what demands the stop is not stored
-        is_light = np.zeros(NUM_OBSTACLES, bool)
-        is_light[: len(lines)] = [line["is_light"] for line in lines]
-        row["obstacles.is_light"] = is_light
-        # for the check of the labels only: whose box it is, -1: nobody's
-        row["obstacles.track"] = np.full(NUM_OBSTACLES, -1)
-        row["obstacles.track"][len(lines) : end] = near[:room]
-        row["num_bodies"] = len(near)
+                made[slot] = line.get(name, rest)
+            made[len(lines) : len(lines) + len(of)] = of
+            row[f"obstacles.{name}"] = made
+        row["num_bodies"] = near
 
     def _boxes(
         self,
         row: dict,
-        view: FrameTracks,
+        view: np.ndarray,
         others: np.ndarray,
         clock: np.ndarray,
-        motion: Motion,
         room: int,
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Other road users in view as boxes at the T times.
+    ) -> tuple[int, dict[str, np.ndarray]]:
+        """Returns the number of road users in view, and the most relevant as boxes.
+
+        Args:
+          row: the scene.
+          view: [samples, 4] of `_view`.
+          others: numbers of tracks at the time.
+          clock: [T] s.
+          room: boxes at most.
 
         Returns:
-          (near, boxes): numbers of all tracks in view, the most relevant first, and
-          `BOX` [k, T] of the first k <= room of them.
+          (number, fields of OBSTACLES, [k] or [k, T] each, k <= room).
         """
         frames = clock * self.rate - self._first[others, None]  # [n, T]
         last = (self._last - self._first)[others, None]
         valid = (frames >= -1e-6) & (frames <= last + 1e-6)
         at = np.clip(frames, 0.0, last)
         low = np.minimum(at.astype(int), np.maximum(last - 1, 0))
-        share = np.where(last > 0, at - low, 0.0)
-        s, l, tilt, speed = view.at(self._offset[others, None] + low, share)
-        s = s - motion.s0
+        share = np.where(last > 0, at - low, 0.0)[..., None]
+        low = self._offset[others, None] + low
+        mixed = view[low] * (1.0 - share)
+        mixed += view[np.minimum(low + 1, len(view) - 1)] * share
+        s, l, tilt, speed = np.moveaxis(mixed, -1, 0)
+        s = s - row["s0"]
         seen = valid & (s > -VIEW_BEHIND_M) & (s < GRID_M[-1])
-        seen &= np.abs(l - motion.l[0]) < VIEW_BESIDE_M
+        seen &= np.abs(l - row["ego.l"]) < VIEW_BESIDE_M
         # where a road meets itself, the nearest station jumps
         seen &= np.abs(speed) < MAX_SPEED_MPS
         half = 0.5 * (self._size[others, 1] + row["ego.width"])
-        apart = relevance_distance(s, l, seen, half, motion.v0, row["path.l"])
+        apart = relevance_distance(s, l, seen, half, row["ego.v"], row["path.l"])
         order = np.argsort(apart, kind="stable")
         order = order[np.isfinite(apart[order])]
         most = order[:room]
-        s, l, tilt = s[most], l[most], tilt[most]
+        s, l, tilt, of = s[most], l[most], tilt[most], others[most]
         along, across = np.abs(np.cos(tilt)), np.abs(np.sin(tilt))
-        length, width = self._size[others[most]].T[..., None]
+        length, width = self._size[of].T[..., None]
         half_s = 0.5 * (length * along + width * across)
         half_l = 0.5 * (length * across + width * along)
         # acceleration and lateral speed at the planning frame, over +-1 sample
-        of = others[most]
         frame = np.rint(clock[0] * self.rate).astype(int) - self._first[of]
         last = self._last[of] - self._first[of]
         before, after = (np.clip(frame + step, 0, last) for step in (-1, 1))
-        low, high = (view.table[self._offset[of] + at] for at in (before, after))
+        low, high = (view[self._offset[of] + at] for at in (before, after))
         change = (high - low) / (np.maximum(after - before, 1) / self.rate)[:, None]
-        return others[order], {
+        return order.size, {
             "s_lower": s - half_s,
             "s_upper": s + half_s,
             "l_lower": l - half_l,
             "l_upper": l + half_l,
             "speed": speed[most],
             "valid": seen[most],
+            "kind": self._kind[of],
             "a": change[:, 3],
             "l_dot": change[:, 1],
+            "track": of,
         }
 
-    def _missing(self, frame: LaneFrame, start: int, number: int) -> np.ndarray:
-        """Return station and offset [g, T, 2] of agents missing from the file."""
-        smooth, missing = self.tracks[number], self.recording.missing_agents
+    def _missing(self, row: dict, frame: LaneFrame) -> np.ndarray:
+        """Returns station and offset [g, T, 2] of agents missing from the file."""
+        missing = self.recording.missing_agents
         if frame.chain not in self._missing_views:
             views = self._missing_views[frame.chain] = []
             for agent in missing:
@@ -378,14 +353,13 @@ class Collector:
                 )
                 times = agent.t0 + share * (agent.t1 - agent.t0)
                 views.append((times, *project(frame, x, y)))
-        clock = (smooth.first_frame + start) / self.rate + TIMES_S
-        s0 = self.view(frame).s[number][start]
+        clock = row["frame"] / self.rate + TIMES_S
         found = np.empty((len(missing), TIMES_S.size, 2))
-        for row, (times, s, l) in zip(
+        for out, (times, s, l) in zip(
             found, self._missing_views[frame.chain], strict=True
         ):
-            row[:, 0] = np.interp(clock, times, s) - s0
-            row[:, 1] = np.interp(clock, times, l)
+            out[:, 0] = np.interp(clock, times, s) - row["s0"]
+            out[:, 1] = np.interp(clock, times, l)
         return found
 
 
@@ -415,19 +389,6 @@ def stack_scenes(rows: list[dict]) -> Scene:
 _complete = jax.jit(jax.vmap(trajectory_from_positions))
 
 
-def human_trajectories(scene: Scene, s: np.ndarray, l: np.ndarray) -> Trajectory:
-    """The humans' Trajectories [n, T] through the operator shared with candidates."""
-    count = s.shape[0]
-    parts = []
-    for start in range(0, count, CHUNK):
-        index = np.minimum(np.arange(start, start + CHUNK), count - 1)
-        chunk = jax.tree.map(lambda x, index=index: x[index], scene)
-        full = _complete(chunk, s[index], l[index])
-        keep = min(CHUNK, count - start)
-        parts.append(jax.tree.map(lambda x, keep=keep: np.asarray(x)[:keep], full))
-    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
-
-
 def assemble(
     rows: list[dict], *, vehicles: list[int], groups: list[int], recording: int
 ) -> Demonstration:
@@ -442,20 +403,28 @@ def assemble(
     Returns:
       Demonstration with numpy leaves [n, ...].
     """
-    scene = stack_scenes(rows)
+    scene, count = stack_scenes(rows), len(rows)
 
     def column(name: str, dtype: type) -> Any:  # noqa: ANN401
         return np.array([row[name] for row in rows], dtype)
 
     s, l = column("human.s", np.float32), column("human.l", np.float32)
+    # the humans' trajectories, through the operator shared with candidates
+    parts = []
+    for start in range(0, count, CHUNK):
+        index = np.minimum(np.arange(start, start + CHUNK), count - 1)
+        chunk = jax.tree.map(lambda x, index=index: x[index], scene)
+        full = _complete(chunk, s[index], l[index])
+        keep = min(CHUNK, count - start)
+        parts.append(jax.tree.map(lambda x, keep=keep: np.asarray(x)[:keep], full))
     numbers: dict[str, Any] = {
         "vehicle": np.array(vehicles, np.int32),
-        "recording": np.full(len(rows), recording, np.int32),
+        "recording": np.full(count, recording, np.int32),
         "group": np.array(groups, np.int32),
     }
     return Demonstration(
         scene=scene,
-        human=human_trajectories(scene, s, l),
+        human=jax.tree.map(lambda *x: np.concatenate(x), *parts),
         decisions=column("decisions", np.int32),
         future_s=column("future_s", np.float32),
         s_at_5s=column("s_at_5s", np.float32),

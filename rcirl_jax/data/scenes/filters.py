@@ -14,7 +14,7 @@ from rcirl_jax.data.scenes.manoeuvres import (
     NUDGE_RANGE_M,
     NUDGE_SPEED_MPS,
 )
-from rcirl_jax.data.scenes.motion import GRID_M, Motion
+from rcirl_jax.data.scenes.motion import GRID_M
 from rcirl_jax.types import Kind
 from rcirl_jax.units import DT_S, NUM_TIMES, TIMES_S
 
@@ -55,57 +55,54 @@ EARLY_S = 1e-6  # s, by which two times of one sample may differ
 SAME_PLACE_M = 2.0  # m, within which a track that begins goes on for one that ended
 
 
-def reject_motion(row: dict, motion: Motion, config: CollectConfig) -> str | None:
-    """Return the first reason to drop a scene for how its human drives, or None.
+def reject_motion(row: dict, config: CollectConfig) -> str | None:
+    """Returns the first reason to drop a scene for how its human drives, or None.
 
     Asked before anybody else is looked at: where traffic flows this drops most.
 
     Args:
       row: the scene's flat arrays, without obstacles.
-      motion: the human's motion.
       config: which filters are on.
     """
-    valid = row["time_valid"]
-    left = np.interp(motion.s, GRID_M, row["path.road_left"])
-    right = np.interp(motion.s, GRID_M, row["path.road_right"])
-    out = (motion.l > left + OFF_ROAD_M) | (motion.l < right - OFF_ROAD_M)
+    valid, s, l = row["time_valid"], row["human.s"], row["human.l"]
+    left = np.interp(s, GRID_M, row["path.road_left"])
+    right = np.interp(s, GRID_M, row["path.road_right"])
+    out = (l > left + OFF_ROAD_M) | (l < right - OFF_ROAD_M)
     if np.any(out & valid):
         return "far_from_road"
-    speeds = np.diff(motion.s)[valid[1:]] / DT_S
+    speeds = np.diff(s)[valid[1:]] / DT_S
     a = np.diff(speeds) / DT_S
     if (
         np.any(np.abs(a) > MAX_ACCELERATION_MPS2)
         or np.any(np.abs(np.diff(a) / DT_S) > MAX_JERK_MPS3)
-        or abs(motion.a0) > MAX_ACCELERATION_MPS2
+        or abs(row["ego.a"]) > MAX_ACCELERATION_MPS2
     ):
         return "too_noisy"
-    change = np.ptp(np.append(speeds, motion.v0))
+    change = np.ptp(np.append(speeds, row["ego.v"]))
     if config.require_speed_change and change < MIN_SPEED_CHANGE_MPS:
         return "no_speed_change"
     return None
 
 
-def reject(
-    row: dict, motion: Motion, config: CollectConfig, missing: np.ndarray
-) -> str | None:
-    """Return the first reason to drop a scene for who else is there, or None.
+def reject(row: dict, config: CollectConfig, missing: np.ndarray) -> str | None:
+    """Returns the first reason to drop a scene for who else is there, or None.
 
     Args:
-      row: the scene's flat arrays.
-      motion: the human's motion, kept by `reject_motion`.
+      row: the scene's flat arrays, kept by `reject_motion`.
       config: which filters are on.
       missing: [g, T, 2] station and offset of agents missing from the file.
     """
     if config.require_obstacles and row["num_bodies"] == 0:
         return "no_obstacles"
     half_length, half_width = 0.5 * row["ego.length"], 0.5 * row["ego.width"]
+    s, l = row["human.s"], row["human.l"]
     gap = np.maximum(
-        row["obstacles.s_lower"] - motion.s - half_length,
-        motion.s - half_length - row["obstacles.s_upper"],
+        row["obstacles.s_lower"] - s - half_length,
+        s - half_length - row["obstacles.s_upper"],
     )
     lateral = np.maximum(
-        row["obstacles.l_lower"] - motion.l - half_width,
-        motion.l - half_width - row["obstacles.l_upper"],
+        row["obstacles.l_lower"] - l - half_width,
+        l - half_width - row["obstacles.l_upper"],
     )
     kind = row["obstacles.kind"][:, None]
     body = row["obstacles.valid"] & (kind >= Kind.VEHICLE) & (kind <= Kind.STATIC)
@@ -113,18 +110,16 @@ def reject(
         return "overlapping_boxes"
     # a missing agent drives in the ego's lane, nobody in between
     for agent in missing:
-        ahead = (agent[:, 0] > motion.s) & (
-            np.abs(agent[:, 1] - motion.l) < SAME_LANE_M
-        )
+        ahead = (agent[:, 0] > s) & (np.abs(agent[:, 1] - l) < SAME_LANE_M)
         if not ahead[: ahead.size // 2].any():
             continue
         middle = 0.5 * (row["obstacles.s_lower"] + row["obstacles.s_upper"])
         lateral = 0.5 * (row["obstacles.l_lower"] + row["obstacles.l_upper"])
         between = (
             row["obstacles.valid"]
-            & (middle > motion.s)
+            & (middle > s)
             & (middle < agent[:, 0])
-            & (np.abs(lateral - motion.l) < SAME_LANE_M)
+            & (np.abs(lateral - l) < SAME_LANE_M)
         ).any(axis=0)
         if np.any(ahead & ~between & row["time_valid"]):
             return "follows_missing_car"
@@ -135,7 +130,7 @@ def reject(
 
 
 def surroundings_end(row: dict, ends: np.ndarray) -> float:
-    """Return when the first road user that the human reacts to leaves the record.
+    """Returns when the first road user that the human reacts to leaves the record.
 
     At the end of its track it matters if it is the nearest one ahead on the human's
     own path, or one beside it that the human is about to pass (`labels`: nudge).
@@ -160,7 +155,7 @@ def surroundings_end(row: dict, ends: np.ndarray) -> float:
 
 
 def _matters(row: dict, slot: int, end: float) -> bool:
-    """Return whether the human reacts to the road user whose track ends; see above.
+    """Returns whether the human reacts to the road user whose track ends; see above.
 
     Judged at the next time of the axis: until then it drives on at its last speed.
     """

@@ -6,7 +6,6 @@ import numpy as np
 
 from rcirl_jax.data.scenes.config import SignalChecks
 from rcirl_jax.data.scenes.lanes import LaneFrame, project
-from rcirl_jax.data.scenes.motion import Motion
 from rcirl_jax.types import Kind, Recording, Signal, Track
 from rcirl_jax.units import EGO_LENGTH_M, LINE_HALF_WIDTH_M, TIMES_S
 
@@ -111,8 +110,8 @@ def line_obstacles(
     frame: LaneFrame,
     track: Track,
     signals: dict[str, Signal],
+    row: dict,
     clock: np.ndarray,
-    motion: Motion,
 ) -> list[dict]:
     """Stop lines ahead, by time of demand, and the destination.
 
@@ -123,12 +122,12 @@ def line_obstacles(
     with its front over a light's line meets the line just before its front, because it
     waits to be allowed to go.
     """
-    rows = []
+    rows, v0 = [], row["ego.v"]
     front = 0.5 * track.length
     for station, lane in frame.stop_lines:
-        ahead = station - motion.s0
+        ahead = station - row["s0"]
         lights = [signals[name] for name in lane.signal_ids if name in signals]
-        if lights and motion.v0 < STANDING_MPS and 0.0 < front - ahead <= OVER_M:
+        if lights and v0 < STANDING_MPS and 0.0 < front - ahead <= OVER_M:
             ahead = front + CREEP_M
         if not front <= ahead <= LOOK_AHEAD_M:
             continue
@@ -138,14 +137,14 @@ def line_obstacles(
             demand = (states == "red").any(axis=0)
         is_light = bool(demand[0])
         if lane.stop_sign:
-            arrival = 2.0 * (ahead - front) / max(motion.v0, 0.5)
+            arrival = 2.0 * (ahead - front) / max(v0, 0.5)
             demand |= arrival + STOP_SIGN_WAIT_S > TIMES_S
         if demand.any():
             rows.append(_line(ahead, demand, Kind.STOP, is_light))
     if track.destination is not None:
         s, l = project(frame, *np.array(track.destination)[:, None])
         # the car stands ON its destination: the line lies at its front bumper
-        ahead = float(s[0]) - motion.s0 + 0.5 * (track.length or EGO_LENGTH_M)
+        ahead = float(s[0]) - row["s0"] + 0.5 * (track.length or EGO_LENGTH_M)
         if abs(l[0]) <= LINE_HALF_WIDTH_M and 0.0 < ahead <= LOOK_AHEAD_M:
             rows.append(_line(ahead, np.ones(TIMES_S.size, bool), Kind.VIRTUAL))
     return rows[:4]

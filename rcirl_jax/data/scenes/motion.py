@@ -15,44 +15,6 @@ ACCELERATION_WINDOW_S = 0.7  # s, smoothing of the ego's acceleration
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class FrameTracks:
-    """All samples of a recording in one chain's Frenet frame."""
-
-    s: list[np.ndarray]  # per track [n] m
-    l: list[np.ndarray]  # per track [n] m
-    tilt: list[np.ndarray]  # per track [n] rad, heading minus the line's, unwrapped
-    # all samples, track after track, for reading many tracks at once: station m,
-    # offset m, tilt rad, speed along the line m/s
-    table: np.ndarray  # [samples, 4]
-
-    def at(self, row: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, ...]:
-        """(s, l, tilt, speed), each [...], between sample `row` and the next.
-
-        Args:
-          row: [...] int, index into `table`.
-          share: [...] in [0, 1] of the way to the next sample; 0 at a track's last.
-        """
-        after = np.minimum(row + 1, len(self.table) - 1)
-        mixed = self.table[row] * (1.0 - share[..., None])
-        mixed += self.table[after] * share[..., None]
-        return tuple(np.moveaxis(mixed, -1, 0))
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Motion:
-    """What the human did after the planning frame, in the scene's frame."""
-
-    s0: float  # m, station of the planning frame on the chain
-    s: np.ndarray  # [T] m since s0; continued at constant speed after the future
-    l: np.ndarray  # [T] m
-    v0: float  # m/s
-    a0: float  # m/s^2
-    dl0: float  # 1, dl/ds at the planning frame
-    future_s: float  # s of recording after the frame, <= 8
-    s_at_5s: float  # m
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class Driver:
     """One track in a chain's frame, with the derivatives that all its scenes share."""
 
@@ -64,9 +26,8 @@ class Driver:
     rate: float  # Hz
 
 
-def driver_of(view: FrameTracks, number: int, rate: float) -> Driver:
-    """Track `number` of a chain's frame as a driver; rate in Hz."""
-    s, l = view.s[number], view.l[number]
+def driver_of(s: np.ndarray, l: np.ndarray, rate: float) -> Driver:
+    """Returns the driver with stations s and offsets l [n] m, at `rate` Hz."""
     speed = np.gradient(s) * rate
     return Driver(
         s=s,
@@ -78,12 +39,22 @@ def driver_of(view: FrameTracks, number: int, rate: float) -> Driver:
     )
 
 
-def human_motion(driver: Driver, start: int, length: float) -> Motion | None:
-    """Return the human's positions at TIMES_S and the ego's state at the frame.
+def human_motion(driver: Driver, start: int, length: float) -> dict | None:
+    """Returns the human's positions at TIMES_S and the ego's state at the frame.
 
-    v0 and a0 are the first and second derivative of the cubic fitted by the
-    smoothing filter; all later derivatives are made by `sampling.kinematics`.
-    None if the driver leaves the chain's stations, 0 to `length` m.
+    Speed and acceleration are the first and second derivative of the cubic fitted by
+    the smoothing filter; all later derivatives are made by `sampling.kinematics`.
+
+    Args:
+      driver: the human.
+      start: sample of the planning frame.
+      length: m of the chain.
+
+    Returns:
+      Fields of a row: "ego.*"; "human.s" since the frame, continued at constant speed
+      after the future, and "human.l" [T] m; "time_valid" [T]; "future_s", recorded
+      after the frame, <= 8 s; "s_at_5s" m; "s0" m, the frame's station. None if the
+      driver leaves the chain's stations.
     """
     future = driver.s[start:]
     within = future[: int(HORIZON_S * driver.rate) + 2]
@@ -95,17 +66,22 @@ def human_motion(driver: Driver, start: int, length: float) -> Motion | None:
     v_end = max(float(np.mean(driver.speed[-3:])), 0.0)
     beyond = np.maximum(TIMES_S - seconds[-1], 0.0)
     v0 = max(float(driver.speed[start]), 0.0)
-    l_dot = float(driver.l_dot[start])
-    return Motion(
-        s0=float(future[0]),
-        s=np.interp(TIMES_S, seconds, monotone) + v_end * beyond,
-        l=np.interp(TIMES_S, seconds, driver.l[start:]),
-        v0=v0,
-        a0=float(driver.acceleration[start]),
-        dl0=float(np.clip(l_dot / v0, -0.3, 0.3)) if v0 > 1.0 else 0.0,
-        future_s=future_s,
-        s_at_5s=float(np.interp(5.0, seconds, monotone)),
-    )
+    slope = float(np.clip(driver.l_dot[start] / v0, -0.3, 0.3)) if v0 > 1.0 else 0.0
+    l = np.interp(TIMES_S, seconds, driver.l[start:])
+    return {
+        "s0": float(future[0]),
+        "ego.s": 0.0,
+        "ego.l": l[0],
+        "ego.dl": slope,
+        "ego.ddl": 0.0,
+        "ego.v": v0,
+        "ego.a": float(driver.acceleration[start]),
+        "human.s": np.interp(TIMES_S, seconds, monotone) + v_end * beyond,
+        "human.l": l,
+        "future_s": future_s,
+        "s_at_5s": float(np.interp(5.0, seconds, monotone)),
+        "time_valid": future_s + 1e-6 >= TIMES_S,
+    }
 
 
 def given_path(

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.importing import digest
-from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.scenes.collect import Collector, assemble
 from rcirl_jax.data.scenes.config import CollectConfig
@@ -15,7 +14,7 @@ from rcirl_jax.data.scenes.filters import REASONS
 from rcirl_jax.data.scenes.labels import labels_of
 from rcirl_jax.data.scenes.lanes import LaneGraph
 from rcirl_jax.data.scenes.lines import CREEP_M
-from rcirl_jax.data.scenes.motion import FrameTracks, driver_of, given_path
+from rcirl_jax.data.scenes.motion import driver_of, given_path
 from rcirl_jax.data.scenes.tracks import harsh_share, savgol
 from rcirl_jax.sampling import trajectory_from_positions
 from rcirl_jax.types import (
@@ -140,18 +139,15 @@ def test_the_path_turns_along_the_lane_after_the_record():
     """It ends 80 m ahead with a slope of 0.05: 0.05 * 10 m more, and no sharp bend."""
     t = np.arange(0.0, 8.05, 0.1)
     s = 10.0 * t
-    view = FrameTracks(s=[s], l=[0.05 * s], tilt=[0.0 * s], table=np.zeros((1, 4)))
     grid = 2.0 * np.arange(128)
-    path = given_path(driver_of(view, 0, 10.0), 0, 0.0, 1e3)
+    path = given_path(driver_of(s, 0.05 * s, 10.0), 0, 0.0, 1e3)
     beyond = np.maximum(grid - 80.0, 0.0)
     expected = 0.05 * np.minimum(grid, 80.0) + 0.5 - 0.5 * np.exp(-beyond / 10.0)
     np.testing.assert_allclose(path, expected, atol=1e-9)
     bend = np.gradient(np.gradient(path, 2.0), 2.0)
     assert np.abs(bend).max() < 0.05 / 10.0  # held at its offset: 0.05 / 4
-    stands = FrameTracks(s=[0 * s], l=[0 * s + 1.0], tilt=[0 * s], table=view.table)
-    np.testing.assert_array_equal(
-        given_path(driver_of(stands, 0, 10.0), 0, 0.0, 1e3), 1.0
-    )
+    stands = driver_of(0 * s, 0 * s + 1.0, 10.0)
+    np.testing.assert_array_equal(given_path(stands, 0, 0.0, 1e3), 1.0)
 
 
 def test_the_branch_that_was_driven():
@@ -323,18 +319,6 @@ def test_assembled_human_is_the_shared_operators():
     )
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(block.human), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-5)
-
-
-def test_a_quality_report_passes_through_its_state():
-    collector = Collector(PAIR, NO_FILTER)
-    report, again = QualityReport(), QualityReport()
-    rows = list(collector.scenes())
-    zeros = [0] * len(rows)
-    report.add_recording(collector)
-    report.add_scenes(assemble(rows, vehicles=zeros, groups=zeros, recording=0))
-    again.merge(report.state())
-    assert again.as_dict() == report.as_dict()
-    assert set(report.as_dict()["dropped"]) == set(REASONS)
 
 
 def other(value):

@@ -45,12 +45,8 @@ def test_a_minimum_life(begin, end, kept):
     found, counts = steady_tracks(made, CollectConfig())
     assert [track.id for track in found.tracks] == ["ego", "other"][: 1 + kept]
     assert counts == ({} if kept else {SHORT: 1})
-
-
-def test_a_life_that_began_before_this_piece_of_the_log():
-    part = between(car("other", speeding_up(60.0)), 3.0, 3.5)
-    whole = dataclasses.replace(part, seen_since=-4.0)
-    assert not steady_tracks(recording(EGO, whole), CollectConfig())[1]
+    earlier = dataclasses.replace(made.tracks[1], seen_since=-4.0)  # in a longer log
+    assert not steady_tracks(recording(EGO, earlier), CollectConfig())[1]
 
 
 def test_a_minimum_size():
@@ -87,18 +83,16 @@ def test_fragments_of_a_standing_body_are_one():
     assert row["obstacles.valid"][0].all()
 
 
-def test_two_names_at_a_time_for_one_body():
+def test_one_body_under_two_names():
+    """Both at a time; and a waiting car that drives off under the other."""
     whole = standing()
     one, two = between(whole, 0.0, 6.0, "1"), between(whole, 4.0, 12.0, "2")
     (made,) = joined([one, two], 5.0)
     np.testing.assert_allclose(made.t, whole.t)
-
-
-def test_a_waiting_car_that_drives_off_under_another_name():
     whole = car("a", starting)
-    made = joined([between(whole, 0.0, 5.0, "1"), between(whole, 6.0, 12.0, "2")], 5.0)
-    assert [track.id for track in made] == ["1"]
-    assert made[0].x[-1] == pytest.approx(88.0)
+    (made,) = joined([between(whole, 0.0, 5.0, "1"), between(whole, 6.0, 12.0)], 5.0)
+    assert made.id == "1"
+    assert made.x[-1] == pytest.approx(88.0)
 
 
 @pytest.mark.parametrize(

@@ -83,14 +83,3 @@ def test_both_doors_choose_the_same_of_a_crowd():
     )  # fmt: skip
     chosen = jax.jit(most_relevant)(bodies, human, path) + 1
     assert row["obstacles.track"][:NUM_BODIES].tolist() == chosen.tolist()
-
-
-def test_beside_is_after_ahead_and_before_behind():
-    ego = car("ego", lambda t: 60.0 + 12.0 * t)
-    others = [
-        car("behind", lambda t: 20.0 + 12.0 * t),
-        car("beside", lambda t: 85.0 + 12.0 * t, y=WIDTH),
-        car("ahead", lambda t: 90.0 + 12.0 * t),
-    ]
-    row = first_scene(recording(ego, *others))
-    assert row["obstacles.track"][:3].tolist() == [3, 2, 1]

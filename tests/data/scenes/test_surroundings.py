@@ -52,60 +52,44 @@ def test_the_mask_ends_with_the_leader():
     assert not row["obstacles.valid"][lead, ~row["time_valid"]].any()
 
 
-UNCHANGED = {
-    "a leader of the leader": [car("lead", steady(20.0)), ("gone", steady(40.0), 0.0)],
-    "behind": [car("lead", steady(20.0)), ("gone", steady(-15.0), 0.0)],
-    "beside, as fast": [car("lead", steady(20.0)), ("gone", steady(10.0), WIDTH)],
-    "overtaken before": [("gone", steady(16.0, v=4.0), WIDTH)],
-    "two lanes away": [
-        car("mid", steady(20.0), y=WIDTH),
-        ("gone", steady(20.0, v=6.0), -2 * WIDTH),
-    ],
-    "with the human": [car("lead", steady(20.0))],
+def after(track, begin):
+    """The part of a track after a time."""
+    later = track.t > begin
+    return dataclasses.replace(track, **{k: getattr(track, k)[later] for k in SERIES})
+
+
+def aside(t):
+    return WIDTH * smooth_step(t, 1.0, 3.0)
+
+
+def gone(start, v=12.0, y=0.0, seconds=5.0):
+    return car("gone", steady(start, v), y=y, seconds=seconds)
+
+
+LEAD = car("lead", steady(20.0))
+# when the surroundings end, who is there
+SURROUNDINGS = {
+    "a leader of the leader": (None, LEAD, gone(40.0)),
+    "behind": (None, LEAD, gone(-15.0)),
+    "beside, as fast": (None, LEAD, gone(10.0, y=WIDTH)),
+    "overtaken before": (None, gone(16.0, v=4.0, y=WIDTH)),
+    "two lanes away": (None, gone(40.0, v=4.0, y=2 * WIDTH, seconds=4.0)),
+    "with the human": (None, LEAD),
+    "a leader": (6.0, gone(25.0, seconds=6.0)),
+    "a leader that changes lane": (None, gone(25.0, y=aside, seconds=6.0)),
+    # 12 m/s past 4 m/s: 40 m are made good at 5 s
+    "a slower one beside": (4.0, gone(40.0, v=4.0, y=WIDTH, seconds=4.0)),
+    "one far ahead": (None, gone(150.0, v=4.0, y=WIDTH, seconds=4.0)),
+    # perception gives the leader a new number: nothing is missing
+    "a new number": (None, gone(30.0), after(car("lead", steady(30.0)), 5.05)),
 }
 
 
-@pytest.mark.parametrize("name", UNCHANGED)
-def test_others_end_nothing(name):
-    found = [
-        car(one[0], one[1], y=one[2], seconds=5.0) if isinstance(one, tuple) else one
-        for one in UNCHANGED[name]
-    ]
-    ego = car("ego", steady(0.0), y=-WIDTH if name == "two lanes away" else 0.0)
-    row = first_scene(recording(ego, *found))
-    assert row["time_valid"].all()
-
-
-def test_a_leader_that_changes_lane_ends_nothing_when_it_leaves():
-    def moves(t):
-        return WIDTH * smooth_step(t, 1.0, 3.0)
-
-    made = recording(
-        car("ego", steady(0.0)), car("lead", steady(25.0), y=moves, seconds=6.0)
-    )
-    assert first_scene(made)["time_valid"].all()
-    # the same that stays in the lane, or leaves it after the record's end
-    stays = recording(car("ego", steady(0.0)), car("lead", steady(25.0), seconds=6.0))
-    assert first_scene(stays)["time_valid"].tolist() == mask_until(6.0).tolist()
-
-
-def test_a_slower_one_beside_that_would_be_passed_ends_the_scene():
-    """12 m/s past 4 m/s: 40 m are made good at 5 s, its track ends at 4 s."""
-    slow = car("slow", steady(40.0, v=4.0), y=WIDTH, seconds=4.0)
-    row = first_scene(recording(car("ego", steady(0.0)), slow))
-    assert row["time_valid"].tolist() == mask_until(4.0).tolist()
-    far = car("slow", steady(150.0, v=4.0), y=WIDTH, seconds=4.0)
-    assert first_scene(recording(car("ego", steady(0.0)), far))["time_valid"].all()
-
-
-def test_a_track_that_another_goes_on_for_ends_nothing():
-    """Perception gives the leader a new number: nothing is missing."""
-    first = car("lead#1", steady(30.0), seconds=5.0)
-    whole = car("lead#2", steady(30.0))
-    later = whole.t > 5.05
-    second = dataclasses.replace(whole, **{k: getattr(whole, k)[later] for k in SERIES})
-    row = first_scene(recording(car("ego", steady(0.0)), first, second))
-    assert row["time_valid"].all()
+@pytest.mark.parametrize("name", SURROUNDINGS)
+def test_who_ends_a_scene_when_it_leaves(name):
+    end, *others = SURROUNDINGS[name]
+    row = first_scene(recording(car("ego", steady(0.0)), *others))
+    assert row["time_valid"].tolist() == mask_until(end or 100.0).tolist()
 
 
 @pytest.mark.parametrize(("seconds", "kept"), [(3.4, False), (3.6, True)])
