@@ -12,7 +12,7 @@ import functools
 import json
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -36,18 +36,16 @@ from rcirl_jax.train.featurise import (
     normaliser_rows,
     not_finite,
 )
-from rcirl_jax.train.metrics import MetricsWriter, Progress
+from rcirl_jax.train.metrics import RunLog
 from rcirl_jax.train.parallel import (
     Parallel,
-    Step,
     all_stop_after,
     exit_if_peer_lost,
     is_first,
     parallelise,
 )
 from rcirl_jax.train.state import TrainConfig, TrainState
-from rcirl_jax.train.step import StepMetrics, init_state, make_train_step
-from rcirl_jax.train.trackers import settings_of, time_weights, trackers
+from rcirl_jax.train.step import init_state, make_train_step
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -184,7 +182,6 @@ def _train(
     provenance: dict,
 ) -> TrainResult:
     """`train` in a folder that is this run's alone."""
-    features = feature_map(config.features)
     batches = split_batches(
         dataset,
         "train",
@@ -199,14 +196,13 @@ def _train(
         print(line, file=sys.stderr)
     if checkpoints.latest_step is None:
         rows = normaliser_rows(dataset, config)
-        state = parallel.replicate(init_state(config, fit_normaliser(rows, features)))
+        normaliser = fit_normaliser(rows, feature_map(config.features))
+        state = parallel.replicate(init_state(config, normaliser))
     else:
         like = parallel.replicate(blank_state(config))
         state, position = checkpoints.restore(like)
         batches.restore(position)
     describe_run(workdir, config, dataset, provenance)
-    per_epoch = batches.batches_per_epoch
-    run = _Run(config, running, per_epoch, workdir, state, dataset)
 
     def produce() -> tuple:
         """The next batch, on its devices before its step, and where it stands."""
@@ -217,19 +213,57 @@ def _train(
         placed = parallel.place(host_batch(rows, weight, index))
         return placed, index[weight > 0.0], batches.state()
 
+    def is_due(step: int) -> bool:
+        every = running.checkpoint_every
+        return step % per_epoch == 0 or (every > 0 and step % every == 0)
+
+    step, per_epoch = int(state.step), batches.batches_per_epoch
+    total, summaries = per_epoch * config.epochs, []
     # a signal waits for the end of the step, and for what is being saved
     with (
-        asked() as run.told,
-        contextlib.closing(run),
+        asked() as told,
+        contextlib.closing(
+            RunLog(workdir, config, step, total, running.trackers, shown=is_first())
+        ) as log,
         contextlib.closing(checkpoints),
         Prefetch(produce, running.prefetch) as ahead,
     ):
-        state = run.epochs_from(state, ahead, parallel.step, checkpoints)
+        for epoch in range(step // per_epoch, config.epochs):
+            sums = np.zeros(4)
+            for _ in range(per_epoch - step % per_epoch):
+                batch, index, position = next(ahead)
+                step += 1
+                with exit_if_peer_lost(step):
+                    state, metrics = parallel.step(state, batch)
+                    metrics = jax.device_get(metrics)
+                if not metrics.finite:
+                    refuse_step(state, step, index, dataset, config)
+                sums += log.step(step, metrics)
+                # the same in all processes
+                many = jax.process_count() > 1
+                stop = all_stop_after(step) and signal.SIGTERM if many else told()
+                if stop or is_due(step):
+                    checkpoints.save(state, position)
+                running.on_step(step)
+                if stop:
+                    raise Interrupted(stop)
+            loss, terms, wins, pairs = sums
+            summaries.append(
+                {
+                    "epoch": epoch + 1,
+                    "loss": loss / max(terms, 1.0),
+                    "pair_accuracy": wins / max(pairs, 1.0),
+                    "pairs": int(pairs),
+                }
+            )
+        log.draw_time_weights(
+            step, effective_params(state.params, config.reward)["gamma"]
+        )
     return TrainResult(
         state=state,
-        epochs=run.summaries,
-        queries=run.progress.queries,
-        seconds=run.progress.seconds,
+        epochs=summaries,
+        queries=log.queries,
+        seconds=log.seconds,
         waited_s=ahead.waited_s,
     )
 
@@ -295,109 +329,3 @@ def refuse_step(
         f"train: step {step}: {scene_name(rows, at, int(index[at]))}: {names}: not "
         f"finite{cause}: expected finite numbers; the state before is kept"
     )
-
-
-class _Run:
-    """The loop's bookkeeping: metrics, progress, guard, when to save."""
-
-    def __init__(
-        self,
-        config: TrainConfig,
-        running: Running,
-        per_epoch: int,
-        workdir: Path,
-        state: TrainState,
-        dataset: Demonstrations,
-    ) -> None:
-        self.config, self.running = config, running
-        self.dataset = dataset
-        self.per_epoch, first_step = per_epoch, int(state.step)
-        total = self.per_epoch * config.epochs
-        self.trackers = (
-            trackers(running.trackers, workdir, first_step) if is_first() else []
-        )
-        for tracker in self.trackers:
-            tracker.settings(settings_of(config))
-        self.writer = (
-            MetricsWriter(workdir, first_step, self.trackers) if is_first() else None
-        )
-        self.progress = Progress(total, first_step, "train", shown=is_first())
-        self.summaries: list[dict] = []
-        self.told: Callable[[], int | None] = lambda: None  # signal to end at
-
-    def close(self) -> None:
-        if self.writer is not None:
-            self.writer.close()
-        self.progress.close()
-
-    def epochs_from(
-        self,
-        state: TrainState,
-        batches: Iterator[tuple],
-        take_step: Step,
-        checkpoints: Checkpoints,
-    ) -> TrainState:
-        step = int(state.step)
-        for epoch in range(step // self.per_epoch, self.config.epochs):
-            sums = np.zeros(4)
-            for _ in range(self.per_epoch - step % self.per_epoch):
-                batch, index, position = next(batches)
-                step += 1
-                with exit_if_peer_lost(step):
-                    state, metrics = take_step(state, batch)
-                    metrics = jax.device_get(metrics)
-                if not metrics.finite:
-                    refuse_step(state, step, index, self.dataset, self.config)
-                sums += self._after_step(step, metrics)
-                stop = self._told_to_stop(step)
-                if stop or self._is_due(step):
-                    checkpoints.save(state, position)
-                self.running.on_step(step)
-                if stop:
-                    raise Interrupted(stop)
-            self.summaries.append(_summary(epoch, sums))
-        self._draw_time_weights(step, state)
-        return state
-
-    def _draw_time_weights(self, step: int, state: TrainState) -> None:
-        """Gamma over time, for the trackers."""
-        if self.trackers:
-            gamma = effective_params(state.params, self.config.reward)["gamma"]
-            if (figure := time_weights(np.asarray(gamma))) is not None:
-                for tracker in self.trackers:
-                    tracker.figure(step, "time weights", figure)
-
-    def _told_to_stop(self, step: int) -> int | None:
-        """Number of a signal to end after this step, the same in all processes."""
-        if jax.process_count() > 1:
-            return signal.SIGTERM if all_stop_after(step) else None
-        return self.told()
-
-    def _is_due(self, step: int) -> bool:
-        every = self.running.checkpoint_every
-        return step % self.per_epoch == 0 or (every > 0 and step % every == 0)
-
-    def _after_step(self, step: int, metrics: StepMetrics) -> np.ndarray:
-        pairs = max(float(metrics.pairs), 1.0)
-        shown = {
-            "loss": float(metrics.loss_sum) / max(float(metrics.terms), 1.0),
-            "pair_accuracy": float(metrics.wins) / pairs,
-        }
-        self.progress.advance(pairs, **shown)
-        if self.writer is not None:
-            rate = self.progress.queries / self.progress.seconds
-            norm = float(metrics.grad_norm)
-            more = {"grad_norm": norm, "pairs": pairs, "queries_per_s": rate}
-            self.writer.write(step, {**shown, **more})
-        counted = (metrics.loss_sum, metrics.terms, metrics.wins, metrics.pairs)
-        return np.array([float(x) for x in counted])
-
-
-def _summary(epoch: int, sums: np.ndarray) -> dict:
-    loss, terms, wins, pairs = sums
-    return {
-        "epoch": epoch + 1,
-        "loss": loss / max(terms, 1.0),
-        "pair_accuracy": wins / max(pairs, 1.0),
-        "pairs": int(sums[2]),
-    }

@@ -8,10 +8,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jax.typing import ArrayLike
+
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import named, parse_json, write_whole
 from rcirl_jax.runtime.compiling import CompilesFirst
-from rcirl_jax.train.trackers import Writer
+from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.train.step import StepMetrics
+from rcirl_jax.train.trackers import Writer, settings_of, time_weights, trackers
 
 MAX_STEP = 2**63 - 1  # what 64 bits hold
 
@@ -98,42 +103,79 @@ def _is_number(value: Any) -> bool:  # noqa: ANN401
     return value is None or (type(value) in {int, float} and abs(value) < 1e300)
 
 
-class Progress:
-    """A progress bar with queries/s and ETA on stderr."""
+class RunLog:
+    """Writes a training's steps: metrics.jsonl, trackers, a bar with queries/s and ETA.
+
+    Attributes:
+      queries: pairs compared so far in this process.
+    """
 
     def __init__(
-        self, total: int, start: int, label: str, *, shown: bool = True
+        self,
+        folder: Path,
+        config: TrainConfig,
+        resume_step: int,
+        total: int,
+        names: Sequence[str] | None,
+        *,
+        shown: bool,
     ) -> None:
+        """Opens the files of a run.
+
+        Args:
+          folder: of the run.
+          config: of the training, for the trackers.
+          resume_step: last step that counts of those written before.
+          total: steps of the whole training.
+          names: of the trackers.
+          shown: False in a process that writes nothing and shows no bar.
+        """
+        made = trackers(names, folder, resume_step) if shown else []
+        for tracker in made:
+            tracker.settings(settings_of(config))
+        self._trackers = made
+        self._writer = MetricsWriter(folder, resume_step, made) if shown else None
         self._bar = CompilesFirst(
             total=total,
-            initial=start,
-            desc=label,
+            initial=resume_step,
+            desc="train",
             unit="step",
             mininterval=0.5,
             disable=not shown,
         )
         self._since = time.perf_counter()
-        self._queries = 0.0
-
-    def advance(self, queries: float, **shown: float) -> None:
-        """One step with so many pairs compared; `shown` values are printed."""
-        self._queries += queries
-        elapsed = max(time.perf_counter() - self._since, 1e-9)
-        rate = self._queries / elapsed
-        text = {name: f"{number:.4g}" for name, number in shown.items()}
-        self._bar.set_postfix({"queries/s": f"{rate:,.0f}", **text}, refresh=False)
-        self._bar.update()
-
-    @property
-    def queries(self) -> float:
-        """Pairs compared so far in this process."""
-        return self._queries
+        self.queries = 0.0
 
     @property
     def seconds(self) -> float:
-        """Wall time since the bar was made."""
+        """Wall time since the first step began."""
         return time.perf_counter() - self._since
 
+    def step(self, step: int, metrics: StepMetrics) -> np.ndarray:
+        """Writes a step; returns its sums: loss, terms, pairs won, pairs."""
+        sums = (metrics.loss_sum, metrics.terms, metrics.wins, metrics.pairs)
+        loss, terms, wins, pairs = counted = np.array([float(x) for x in sums])
+        pairs = max(pairs, 1.0)
+        self.queries += pairs
+        rate = self.queries / max(self.seconds, 1e-9)
+        shown = {"loss": loss / max(terms, 1.0), "pair_accuracy": wins / pairs}
+        text = {name: f"{number:.4g}" for name, number in shown.items()}
+        self._bar.set_postfix({"queries/s": f"{rate:,.0f}", **text}, refresh=False)
+        self._bar.update()
+        if self._writer is not None:
+            norm = float(metrics.grad_norm)
+            more = {"grad_norm": norm, "pairs": pairs, "queries_per_s": rate}
+            self._writer.write(step, {**shown, **more})
+        return counted
+
+    def draw_time_weights(self, step: int, gamma: ArrayLike) -> None:
+        """Gamma over time, for the trackers."""
+        if self._trackers and (figure := time_weights(np.asarray(gamma))) is not None:
+            for tracker in self._trackers:
+                tracker.figure(step, "time weights", figure)
+
     def close(self) -> None:
-        """Leave the bar as it is."""
+        """Closes files and trackers; leaves the bar as it is."""
+        if self._writer is not None:
+            self._writer.close()
         self._bar.close()
