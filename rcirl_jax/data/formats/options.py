@@ -35,13 +35,9 @@ def number(spec: Mapping, key: str, default: float = math.nan) -> float:
     value = spec.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"source TOML: {key}: {value}: expected a number")
-    try:
-        found = float(value)
-    except OverflowError:
-        found = math.inf
-    if not math.isfinite(found):
+    if not math.isfinite(value):
         raise InputError(f"source TOML: {key}: {value}: expected a finite number")
-    return found
+    return float(value)
 
 
 def stated(spec: Mapping, key: str) -> float | None:
@@ -55,7 +51,7 @@ def stated(spec: Mapping, key: str) -> float | None:
 def one_of(spec: Mapping, key: str, allowed: Iterable[str], default: str = "") -> str:
     """Returns an option that is one of some texts."""
     value, names = spec.get(key, default), [*allowed]
-    if not isinstance(value, str) or value not in names:
+    if value not in names:
         raise InputError(
             f"source TOML: {key}: {value}: expected one of {', '.join(names)}"
         )

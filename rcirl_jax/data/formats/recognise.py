@@ -1,5 +1,6 @@
 """Which format an input is of, where nobody says it: by names of files and columns."""
 
+import contextlib
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
@@ -72,10 +73,9 @@ def _format_of(file: Path, source: Path | None) -> str:
             return name
     if not file.is_file():
         return ""
-    try:
+    table = None
+    with contextlib.suppress(InputError):
         table = open_table(file)
-    except InputError:
-        table = None
     header = {name.lower() for name in table.header} if table else set()
     for name, form in forms.items():
         if any(columns <= header for columns in form.columns):

@@ -169,7 +169,6 @@ class RowStore:
         self._held = 0  # bytes of them
         self._given = 0.0  # minutes given as slices
         self._tidied: set[int] = set()
-        self._whole: dict[str | None, Rows] = {}  # recordings of one block
         self._arrays: dict[str, np.ndarray] = {}  # field -> all its texts
 
     def add(self, batch: Batch) -> None:
@@ -261,7 +260,7 @@ class RowStore:
 
     def _values(self, rows: np.ndarray) -> Rows:
         """Field -> [n], texts as texts."""
-        values = {name: rows[:, place] for place, name in enumerate(self._names)}
+        values = dict(zip(self._names, np.ascontiguousarray(rows.T), strict=True))
         values.pop("recording", None)
         for name in self._texts.keys() & values.keys():
             if name not in self._arrays:
@@ -276,8 +275,7 @@ class RowStore:
         minutes = sorted(self._blocks.get(code, ()))
         for minute in minutes if code not in self._tidied else ():
             rows = self._rows(code, minute)
-            values = {name: rows[:, place] for place, name in enumerate(self._names)}
-            kept = self._tidy(values)
+            kept = self._tidy(dict(zip(self._names, rows.T, strict=True)))
             if kept["t"].size < len(rows):
                 self._put(code, minute, np.stack(list(kept.values()), axis=1))
         self._tidied.add(code)
@@ -304,16 +302,8 @@ class RowStore:
     def minutes(self, recording: str | None) -> Iterator[Rows]:
         """Yields the rows of each block of a recording alone, t as in the file."""
         code, minutes = self._minutes(recording)
-        if self.folder is not None:
-            for minute in minutes:
-                yield self._values(self._rows(code, minute))
-            return
-        if recording not in self._whole:
-            # columns lie in one piece each: all of the log is worked on
-            rows = np.asfortranarray(self._rows(code, 0))
-            self._blocks[code][0] = []
-            self._whole[recording] = self._values(rows)
-        yield self._whole[recording]
+        for minute in minutes:
+            yield self._values(self._rows(code, minute))
 
     def _fragments(
         self, code: int, minutes: list[int], max_gap_s: float

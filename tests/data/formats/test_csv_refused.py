@@ -43,7 +43,9 @@ REFUSED = {
     "no header? name the columns by names in [table]": Way(
         content=text(rows()).partition("\n")[2]
     ),
-    "column x: type list<": Way(content=stored(pq.write_table, x=[[1.0]] * 720)),
+    "column x: Unsupported cast from list<": Way(
+        content=stored(pq.write_table, x=[[1.0]] * 720)
+    ),
     # the layout
     "table.separator: unknown: expected some of": moved(
         rest='[table]\nseparator = ";"'

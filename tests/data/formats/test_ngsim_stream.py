@@ -99,16 +99,10 @@ def test_notes_name_what_is_left_out_and_repeated(tmp_path):
     )
 
 
-def native(path, stamp=BEGIN["i-80"][0]):
-    rows = [row for n in range(12) for row in vehicle(n, 60 * n, stamp)]
-    return w.ngsim_text(path, rows)
-
-
 def test_pieces_of_the_native_text_are_those_of_the_csv(tmp_path, monkeypatch):
     monkeypatch.setattr(streams, "READ_CHARS", 10_000)
-    path = native(tmp_path / "native.txt")
-    rows = [line.split() for line in path.read_text().splitlines()]
-    table = w.ngsim_csv(tmp_path / "native.csv", rows)
-    texts, tables = read(path, 1), read(table, 1)
+    rows = [r for n in range(12) for r in vehicle(n, 60 * n, BEGIN["i-80"][0])]
+    texts = read(w.ngsim_text(tmp_path / "native.txt", rows), 1)
+    tables = read(w.ngsim_csv(tmp_path / "native.csv", rows), 1)
     assert [made.name for made in texts] == [f"native-0000{k}" for k in range(3)]
     assert [digest(made) for made in texts] == [digest(made) for made in tables]

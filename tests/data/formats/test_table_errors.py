@@ -51,7 +51,7 @@ WRONG = {
         (".osm_xy", "x='", "x='east", "position: ('east1160.0000', '1003.5000'): exp"),
     ],
     "interaction_challenge": [
-        ("_train.csv", "\n1.0,", "\n,", "line 2: case_id: '': expected a number"),
+        ("_train.csv", "\n1.0,", "\n,", "line 2: case_id: '': expected a finite"),
     ],
     "ngsim_pairs": [
         ("_00046.csv", "x_leader", "leader", "column x_leader: missing"),
@@ -61,7 +61,7 @@ WRONG = {
     ],
     "openacc": [
         ("1.csv", "\nTime,", "\nClock,", "column Time: missing"),
-        ("1.csv", "Speed1", "Speed2", "column 'Speed2': met twice"),
+        ("1.csv", "Speed1", "Speed2", "column Speed2: met twice"),
         ("1.csv", "\n0.1,", "\nsoon,", "line 8: Time: 'soon'"),
         ("1.csv", "\n0.1,", "\n0.0,", "line 8: id of the row: met twice in one frame"),
         ("1.csv", "\n0.1,14", "\n0.1,fast14", "line 8: Speed1: 'fast14"),

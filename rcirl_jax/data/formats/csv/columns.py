@@ -487,10 +487,7 @@ def flags_of(path: Path, texts: Iterable[str], spec: Mapping) -> dict[str, bool]
     Raises:
       InputError: a text that is neither yes nor no.
     """
-    given = spec.get(AUTOMATED, [])
-    if not isinstance(given, list) or not all(isinstance(item, str) for item in given):
-        raise InputError(f"source TOML: {AUTOMATED}: {given}: expected a list of texts")
-    own, found = {item.lower() for item in given}, {}
+    own, found = {item.lower() for item in spec.get(AUTOMATED, [])}, {}
     for text in filter(None, texts):
         plain, point = text.lower(), text.replace(",", ".")
         if own:

@@ -177,12 +177,10 @@ def _recording(name: str, values: Rows, log: Log, meaning: Meaning) -> Recording
 def _track(name: str, rows: Rows, log: Log, meaning: Meaning) -> Track:
     """A track of some rows; what they do not say is that of [defaults]."""
     spec, usual = log.spec, section(log.spec, "defaults")
-    texts = rows.get("kind", np.zeros(1, str))
-    found = str(texts[0])
-    if np.any(texts != found):  # the most frequent one that is known
-        known = collections.Counter(texts[texts != ""].tolist())
-        found = known.most_common(1)[0][0]
-    found = found or str(usual.get("kind", ""))
+    known = collections.Counter(rows.get("kind", np.zeros(0, str)).tolist())
+    del known[""]
+    # the most frequent one
+    found = max(known, key=lambda text: known[text], default=str(usual.get("kind", "")))
     kind = str(section(spec, "kinds").get(found, found or "vehicle")).lower()
     if kind not in KINDS:
         raise InputError(

@@ -155,12 +155,9 @@ def _read(path: Path, spec: dict) -> tuple[Rows, RowStats]:
     NaN where a file or a cell has none; a road user is one of a case.
     """
     table, stats = open_log(path, spec)
-    rows = read(table, fields_of(table, NEEDED, OPTIONAL), stats)
+    case = {"case_id": "number"} if table.has("case_id") else {}
+    rows = read(table, fields_of(table, {**NEEDED, **case}, OPTIONAL), stats)
     rows = dict.fromkeys(OPTIONAL, np.full(rows[LINE].size, np.nan)) | rows
-    unknown = ~np.isfinite(rows["case_id"])
-    if table.has("case_id") and unknown.any():
-        line = rows[LINE][unknown][0]
-        raise InputError(f"{path}: line {line}: case_id: '': expected a number")
     users, codes = np.unique(rows["track_id"], return_inverse=True)
     cases = np.unique(rows["case_id"], return_inverse=True)[1]
     rows["user"] = (cases * users.size + codes).astype(float)

@@ -315,32 +315,27 @@ def _find_map(path: Path, location: str, spec: dict) -> Path | None:
         if given.is_file():
             return given
         return _of_location(sorted(given.rglob("*.osm")), location)
-    folder = path.resolve().parent
+    folder, found = path.resolve().parent, None
     for place in (folder, folder.parent):
-        folders = [place / name for name in MAP_FOLDERS]
-        found = [file for inside in folders for file in sorted(inside.rglob("*.osm"))]
-        match = _of_location([*sorted(place.glob("*.osm")), *found], location)
-        if match is not None:
-            return match
-    return None
+        maps = [*sorted(place.glob("*.osm"))]
+        for name in MAP_FOLDERS:
+            maps += sorted((place / name).rglob("*.osm"))
+        found = found or _of_location(maps, location)
+    return found
 
 
 def _of_location(files: list[Path], location: str) -> Path | None:
     """locationN.osm; else the only map in a folder named N_..., N_*.osm, *_N.osm."""
     digits = location.split(".")[0].lstrip("0") or "0"
-    if not digits.isdigit():
-        return None
-    patterns = (
-        (rf"location_?0*{digits}", "stem"),
-        (rf"0*{digits}_.*", "parent"),
-        (rf"0*{digits}_.*", "stem"),
-        (rf".*_0*{digits}", "stem"),
+    forms = (
+        rf".*/location_?0*{digits}",
+        rf"0*{digits}_.*/(?!location).*",
+        rf".*/0*{digits}_.*",
+        rf".*/.*_0*{digits}",
     )
-    for pattern, part in patterns:
+    for form in forms if digits.isdigit() else ():
         for file in files:
-            if part == "parent" and file.stem.lower().startswith("location"):
-                continue
-            name = file.parent.name if part == "parent" else file.stem
-            if re.fullmatch(pattern, name, flags=re.IGNORECASE):
+            name = f"{file.parent.name}/{file.stem}"
+            if re.fullmatch(form, name, flags=re.IGNORECASE):
                 return file
     return None

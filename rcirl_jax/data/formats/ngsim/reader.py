@@ -125,18 +125,9 @@ def _open(path: Path, spec: dict) -> tuple[Table, RowStats]:
     table, stats = open_log(path, spec)
     is_known = any(table.has(column) for column, _ in NEEDED.values())
     is_numeric = not any(c.isalpha() for c in "".join(table.header))
-    if (
-        table.layout is not None
-        and not is_known
-        and (is_numeric or table.layout.delimiter == BLANKS)
-    ):
+    has_blanks = table.layout is not None and table.layout.delimiter == BLANKS
+    if table.layout is not None and not is_known and (is_numeric or has_blanks):
         columns = spec.get("columns", [])
-        if not isinstance(columns, list) or not all(
-            isinstance(name, str) for name in columns
-        ):
-            raise InputError(
-                f"source TOML: columns: {columns}: expected a list of names"
-            )
         for name, _ in NEEDED.values():
             if name not in columns:
                 raise InputError(f"source TOML: columns: {name}: missing: expected it")
@@ -156,20 +147,16 @@ def _open(path: Path, spec: dict) -> tuple[Table, RowStats]:
 
 
 def _has_stamps(table: Table) -> bool:
-    """Whether Global_Time [ms] is the clock: positive, and not one for all rows."""
-    if not table.has(CLOCK):
-        return False
-    if any(cell and not cell.strip("0.") for cell in table.samples(CLOCK)):
-        return False  # nothing else is read where the first rows say 0
-    lowest, highest = np.inf, -np.inf
-    fields, uncounted = fields_of(table, {CLOCK: "time"}), RowStats(path=table.path)
-    for part in batches(table, fields, uncounted):
-        if part[CLOCK].size:
-            lowest = min(lowest, part[CLOCK].min())
-            highest = max(highest, part[CLOCK].max())
-        if lowest <= 0.0:
-            return False
-    return bool(highest > lowest)
+    """Whether Global_Time [ms] is the clock: positive, and not one for all rows.
+
+    The first few MiB of rows tell.
+    """
+    if table.has(CLOCK):
+        fields, uncounted = fields_of(table, {CLOCK: "time"}), RowStats(path=table.path)
+        for part in batches(table, fields, uncounted):
+            if (stamps := part[CLOCK]).size:
+                return bool(0.0 < stamps.min() < stamps.max())
+    return False
 
 
 def _fields(table: Table, spec: dict, stamped: bool) -> list[Field]:

@@ -157,8 +157,6 @@ def _read_drive(
     kinds: dict[str, str] = {}
     for name in names:
         if match := COLUMN.fullmatch(name):
-            if name in kinds:
-                raise InputError(f"{path}: column {name!r}: met twice: expected once")
             columns.setdefault(int(match[2]), {})[match[1]] = name
             kinds[name] = KINDS.get(match[1], "number")
     options = {"delimiter": ",", "names": header, "skip": len(lines) + 1}

@@ -47,7 +47,7 @@ def numbers(column: Any, decimal: str, thousands: str) -> Found:  # noqa: ANN401
       thousands: mark between their groups of three digits; "": none.
 
     Raises:
-      TypeError: a column of Parquet's that holds no numbers.
+      ArrowException: a column of Parquet's that holds no numbers.
     """
     arrow, compute = extra_module("pyarrow"), extra_module("pyarrow.compute")
     if not is_texts(column):
@@ -97,20 +97,14 @@ def _typed(column: Any) -> np.ndarray:  # noqa: ANN401
         column = column.cast(column.type.value_type)
     if types.is_date(column.type):
         column = column.cast(arrow.timestamp("s"))
-    kind, factor = column.type, None
-    if types.is_temporal(kind):
-        if not hasattr(kind, "unit"):
-            raise TypeError(f"type {str(kind)[:60]}: expected times")
+    kind, factor = column.type, 1.0
+    if types.is_temporal(kind) and hasattr(kind, "unit"):
         factor = SECONDS[kind.unit]
         column = column.cast(arrow.int32() if types.is_time32(kind) else arrow.int64())
     elif types.is_boolean(kind):
         column = column.cast(arrow.int8())
-    elif not (
-        types.is_integer(kind) or types.is_floating(kind) or types.is_decimal(kind)
-    ):
-        raise TypeError(f"type {str(kind)[:60]}: expected numbers")
     made = column.cast(arrow.float64(), safe=False).to_numpy(zero_copy_only=False)
-    return made if factor is None else made * factor
+    return made * factor
 
 
 def times(column: Any, form: str) -> Found:  # noqa: ANN401
@@ -161,7 +155,7 @@ def texts(column: Any, lower: bool) -> tuple[np.ndarray, list[str], np.ndarray]:
     """
     types = extra_module("pyarrow").types
     if types.is_nested(column.type) or types.is_binary(column.type):
-        raise TypeError(f"type {str(column.type)[:60]}: expected text")
+        raise TypeError(f"type {str(column.type)[:60]}")
     coded = column if types.is_dictionary(column.type) else column.dictionary_encode()
     names = []
     for value in coded.dictionary.to_pylist():

@@ -102,14 +102,12 @@ def attach_row_stats(made: Recording, *files: RowStats) -> Recording:
 
 def allowed_share(spec: Mapping) -> float:
     """Returns the option `max_bad_rows` of a source TOML."""
-    value = spec.get("max_bad_rows", MAX_BAD_ROWS)
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not 0.0 <= value < 1.0:
+    value = float(spec.get("max_bad_rows", MAX_BAD_ROWS))
+    if not 0.0 <= value < 1.0:
         raise InputError(
-            f"source TOML: max_bad_rows: {f'{value:g}' if is_number else value}: "
-            "expected a share from 0 to below 1"
+            f"source TOML: max_bad_rows: {value:g}: expected a share from 0 to below 1"
         )
-    return float(value)
+    return value
 
 
 def drop_duplicates(

@@ -273,7 +273,10 @@ def _column(table: Table, field: Field, found: Any) -> _Column:  # noqa: ANN401
             values, wrong = cells.numbers(found, *marks)
     except (TypeError, extra_module("pyarrow").ArrowException) as error:
         why = " ".join(str(error).split())[:200]
-        raise InputError(f"{table.path}: column {field.column}: {why}") from error
+        expected = "texts" if field.text else "times" if field.form else "numbers"
+        raise InputError(
+            f"{table.path}: column {field.column}: {why}: expected {expected}"
+        ) from error
     if names is not None:
         empty = np.array([not name for name in names], bool)[values]
     else:
