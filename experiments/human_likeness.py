@@ -14,7 +14,7 @@ from absl import flags
 
 from rcirl_jax.cli.running import provenance, run
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, rank_scenes, report_of
+from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.learners import (
     LEARNERS,
     learner_configs,
@@ -49,7 +49,7 @@ def main() -> None:
     learned = train_learners(dataset, configs, range(_SEEDS.value))
     rows = {**learned, UNTRAINED_ROW: untrained(next(iter(learned.values())))}
     setup = RankingSetup(preset=base.features, horizon_s=_HORIZON.value)
-    report = report_of(rank_scenes(dataset, scorers(rows), setup))
+    report = evaluate_ranking(dataset, scorers(rows), setup)
     table = format_table(report, 118)
     write_whole(folder / "table.txt", table)
     made_by = {**provenance(), "data_hash": dataset.hash}

@@ -12,6 +12,9 @@ fifteen minutes of a core; the human's curve is told in 88 % of the pairs, the n
 candidate in 63 %: the recording leaves a trace. `--quick`: under a minute.
 """
 
+from collections.abc import Sequence
+
+import jax.numpy as jnp
 import numpy as np
 
 from experiments.paper.common import (
@@ -24,16 +27,37 @@ from experiments.paper.common import (
     write,
 )
 from rcirl_jax.cli.running import run
-from rcirl_jax.evaluation.ranking.learners import FrozenSets, pair_wins, train_learner
+from rcirl_jax.evaluation.ranking.learners import FrozenSets, Learned, train_learner
 from rcirl_jax.evaluation.statistics import ClusterBootstrap, combine_seeds
 from rcirl_jax.features import feature_map
 from rcirl_jax.report.charts import interval_panel
 from rcirl_jax.report.style import figure, label, save
+from rcirl_jax.train.state import FeatureBatch
 
 KEPT = {"a and j": ("acceleration", "jerk"), "all features": None}
 NEAR = 24  # candidates per scene
 fixed(horizon=8.0)
 undefine_flags("positive")  # each in turn
+
+
+def nearest(frozen: FeatureBatch) -> FeatureBatch:
+    """Leaves the `NEAR` candidates of each scene that are nearest to the human."""
+    apart = jnp.where(frozen.feasible, frozen.info.distance, jnp.inf)
+    place = jnp.argsort(jnp.argsort(apart, axis=1), axis=1)
+    return frozen.replace(feasible=frozen.feasible & (place < NEAR))
+
+
+def pair_wins(
+    frozen: FeatureBatch, runs: Sequence[Learned]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs that the positive wins (ties half), [R, S], and pairs [S]."""
+    won, feasible = [], np.asarray(frozen.feasible)
+    points, spread = np.asarray(frozen.points), np.asarray(frozen.points_valid)
+    for one in runs:
+        human = one.scorer(np.asarray(frozen.human), np.asarray(frozen.time_valid))
+        y = one.scorer(points, spread) - human[:, None]
+        won.append(np.sum(((y < 0.0) + 0.5 * (y == 0.0)) * feasible, axis=1))
+    return np.array(won), feasible.sum(axis=1)
 
 
 def main() -> None:
@@ -43,8 +67,8 @@ def main() -> None:
     bootstrap, rows = ClusterBootstrap(vehicle), {}
     for positive in ("human", "nearest"):
         config = base(positive=positive)
-        frozen = FrozenSets(data, nearest=NEAR).of(config)
-        held = FrozenSets(data, "test", nearest=NEAR).of(config)
+        frozen = nearest(FrozenSets(data).of(config))
+        held = nearest(FrozenSets(data, "test").of(config))
         for name, kept in KEPT.items():
             keep = kept or feature_map(config.features).names
             runs = train_learner(frozen, config, seeds(), keep=keep)

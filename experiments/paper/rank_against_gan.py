@@ -63,14 +63,14 @@ from rcirl_jax.data.store.dataset import (
 )
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite
-from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, rank_scenes
+from rcirl_jax.evaluation.ranking.evaluate import rank_scenes
 from rcirl_jax.evaluation.ranking.learners import (
     FrozenSets,
     Learned,
     fitting_rows,
-    train_together,
+    train_learner,
 )
-from rcirl_jax.evaluation.ranking.score import candidates_key
+from rcirl_jax.evaluation.ranking.score import RankingSetup, candidates_key
 from rcirl_jax.evaluation.statistics import (
     Difference,
     combine_seeds,
@@ -154,7 +154,7 @@ def trained(
     numbers = seeds(least=2)
     frozen, found = FrozenSets(data).of(shared), []
     for loss, config in learners.items():
-        runs = train_together(frozen, config, numbers)
+        runs = train_learner(frozen, config, numbers, together=True)
         wins = np.mean([one.wins[-1] for one in runs])
         print(f"{loss}: {100.0 * wins:.1f} % of training pairs won", flush=True)
         found += runs

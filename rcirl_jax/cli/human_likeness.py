@@ -30,7 +30,6 @@ from rcirl_jax.evaluation.ranking.evaluate import (
     RankingSetup,
     pooled,
     rank_scenes,
-    report_of,
 )
 from rcirl_jax.evaluation.ranking.learners import (
     LEARNERS,
@@ -41,6 +40,7 @@ from rcirl_jax.evaluation.ranking.learners import (
 )
 from rcirl_jax.evaluation.ranking.report import (
     UNTRAINED_ROW,
+    build_report,
     format_table,
     markdown_table,
     to_json,
@@ -114,7 +114,7 @@ def main() -> None:
         rows = {**learned, UNTRAINED_ROW: untrained(next(iter(learned.values())))}
         ranked.append(rank_scenes(part, scorers(rows), own))
         failed |= {n for n, runs in learned.items() if not all(x.finite for x in runs)}
-    report = report_of(pooled(ranked))
+    report = build_report(pooled(ranked))
     write_whole(folder / "table.txt", format_table(report, 118))
     write_whole(folder / "table.md", markdown_table(report))
     split_of = parts[0] if len(parts) == 1 else dataset

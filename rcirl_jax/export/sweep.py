@@ -36,15 +36,10 @@ from rcirl_jax.data.store.dataset import Demonstrations, open_datasets
 from rcirl_jax.data.store.splits import Resplit, subsample, with_validation
 from rcirl_jax.errors import MALFORMED, InputError, extra_module
 from rcirl_jax.evaluation.baselines import new_study
-from rcirl_jax.evaluation.ranking.evaluate import (
-    RankingSetup,
-    covered_rows,
-    numbered,
-    outcomes_of,
-    score_rows,
-)
+from rcirl_jax.evaluation.ranking.evaluate import covered_rows
 from rcirl_jax.evaluation.ranking.learners import fitting_rows, normaliser_of
 from rcirl_jax.evaluation.ranking.metrics import METRICS, scene_metrics
+from rcirl_jax.evaluation.ranking.score import RankingSetup, numbered, score_scenes
 from rcirl_jax.evaluation.statistics import ClusterBootstrap, combine_seeds
 from rcirl_jax.export.from_run import verification_samples, write_weights
 from rcirl_jax.export.loading import compiled_scorer, open_reward
@@ -439,13 +434,14 @@ class _Run:
             ]
             for point in points
         }
-        scored = score_rows(rows, index, setup, numbered(rewards), self.executor)
-        outcomes = outcomes_of(scored, rows, setup)
+        scored = score_scenes(rows, index, setup, numbered(rewards), self.executor)
         found = {}
         for point in points:
             keys = [f"{point.name}#{seed}" for seed in range(self.config.seeds)]
             of_seeds = [
-                scene_metrics(scored.values[key], scored.human_values[key], outcomes)
+                scene_metrics(
+                    scored.values[key], scored.human_values[key], scored.outcomes
+                )
                 for key in keys
             ]
             estimates, means = {}, [{} for _ in keys]

@@ -23,7 +23,11 @@ from rcirl_jax.evaluation.baselines import (
     tune,
     valued_scenes,
 )
-from rcirl_jax.evaluation.ranking.score import candidates_key, measure_scenes
+from rcirl_jax.evaluation.ranking.score import (
+    RankingSetup,
+    candidates_key,
+    measure_scenes,
+)
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm, closeness, idm_trajectory
 from rcirl_jax.reward import (
     TUNABLE,
@@ -338,9 +342,8 @@ def test_distances_alone_are_those_of_the_scores():
     """What an import's oracle floor measures, over a padded chunk."""
     rows = driven_by_a_hidden_driver()
     scored = scored_baselines(rows, SMALL, {})
-    near = measure_scenes(
-        rows, DRIVEN, sampler=SMALL, horizon_s=8.0, futures="recorded"
-    )
+    setup = RankingSetup(sampler=SMALL, horizon_s=8.0, futures="recorded")
+    near = measure_scenes(rows, DRIVEN, setup)
     for name in ("feasible", "fde", "ade"):
-        found, wanted = getattr(near, name), getattr(scored, name)
+        found, wanted = getattr(near, name), getattr(scored.outcomes, name)
         np.testing.assert_allclose(found, wanted, atol=1e-4)

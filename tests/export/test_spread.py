@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite
-from rcirl_jax.evaluation.ranking.score import score_scenes
+from rcirl_jax.evaluation.ranking.score import RankingSetup, score_scenes
 from rcirl_jax.export.closed_loop import SuiteJob, drive_by, drive_piece
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.runtime.executors import Processes, Serial
-from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.suite import suite_refs
 from tests.conftest import REPO
 from tests.helpers.weights_files import random_weights
@@ -49,13 +48,11 @@ def scored(weights, executor):
     made = score_scenes(
         rows(),
         np.arange(16),
-        preset="paper21",
-        sampler=SamplerConfig(),
-        horizon_s=5.0,
-        scorers={"learned": open_reward(str(weights)).value},
+        RankingSetup(),
+        {"learned": open_reward(str(weights)).value},
         executor=executor,
     )
-    return leaves(vars(made))
+    return leaves([vars(made.outcomes), made.values, made.human_values])
 
 
 def test_a_piece_is_its_part_of_the_whole(weights):

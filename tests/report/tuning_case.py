@@ -11,7 +11,7 @@ from rcirl_jax.evaluation.closed_loop.runs import SuiteRuns
 from rcirl_jax.evaluation.gate.types import GateConfig, Pair
 from rcirl_jax.evaluation.gate.verdict import judge
 from rcirl_jax.evaluation.ranking.metrics import Outcomes, random_scorer, scene_metrics
-from rcirl_jax.evaluation.ranking.report import build_report
+from rcirl_jax.evaluation.ranking.report import Ranked, build_report
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.report.tuning_page import TuningReport
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
@@ -78,7 +78,7 @@ def ranking():
     )  # fmt: skip
     table = {"candidate": [scene_metrics(-fde, np.ones(60), outcomes)]}
     table["random"] = [scene_metrics(*random_scorer(0, shape), outcomes)]
-    return build_report(table, outcomes, num_resamples=200)
+    return build_report(Ranked(table=table, outcomes=outcomes), num_resamples=200)
 
 
 def small_report(folder, replays):

@@ -28,7 +28,7 @@ from rcirl_jax.reward import (
 from rcirl_jax.train.featurise import CHUNK, NORMALISER_SCENES, valid_feature_rows
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 from rcirl_jax.train.step import init_state
-from rcirl_jax.train.sweep import Fitted, fit, freeze, members_of
+from rcirl_jax.train.sweep import fit, freeze, members_of
 
 # What a learner changes of the shared configuration: loss, fields of its network,
 # others of its training. The linear rewards are not pinned: with unit norm their
@@ -150,15 +150,11 @@ class FrozenSets:
     Args:
       dataset: any dataset.
       split: which scenes.
-      nearest: leave only so many candidates, those nearest to the human; 0: all.
     """
 
-    def __init__(
-        self, dataset: Demonstrations, split: str = "train", *, nearest: int = 0
-    ) -> None:
+    def __init__(self, dataset: Demonstrations, split: str = "train") -> None:
         self.rows, self.index = dataset.load(split), dataset.indices(split)
         self.weights = dataset.weights(self.index)
-        self.nearest = nearest
         self._made: dict[TrainConfig, FeatureBatch] = {}
 
     def of(self, config: TrainConfig) -> FeatureBatch:
@@ -167,10 +163,6 @@ class FrozenSets:
         if key not in self._made:
             made = freeze(self.rows, self.index, key)
             made = made.replace(weight=jnp.asarray(self.weights))
-            if self.nearest:
-                apart = jnp.where(made.feasible, made.info.distance, jnp.inf)
-                place = jnp.argsort(jnp.argsort(apart, axis=1), axis=1)
-                made = made.replace(feasible=made.feasible & (place < self.nearest))
             self._made[key] = made
         return self._made[key]
 
@@ -198,73 +190,53 @@ def normaliser_of(
     return made.replace(scale=jnp.where(kept, made.scale, jnp.inf))
 
 
-def train_together(
-    frozen: FeatureBatch, config: TrainConfig, seeds: Sequence[int]
-) -> list[Learned]:
-    """Several seeds as members of one program; they share the batch order."""
-    members = [dataclasses.replace(config, seed=seed) for seed in seeds]
-    normaliser = normaliser_of(frozen, config)
-    fitted = fit(frozen, normaliser, config, members_of(members))
-    return [
-        _learned(jax.tree.map(lambda leaf, n=n: leaf[n], fitted), normaliser, own)
-        for n, own in enumerate(members)
-    ]
-
-
 def train_learner(
     frozen: FeatureBatch,
     config: TrainConfig,
     seeds: Iterable[int],
     *,
     keep: Sequence[str] | None = None,
+    together: bool = False,
 ) -> list[Learned]:
-    """One configuration trained with several seeds (weights and batch order)."""
+    """Trains one configuration with several seeds.
+
+    Args:
+      frozen: of `FrozenSets`.
+      config: all but the seed.
+      seeds: of the weights, and of the batch order.
+      keep: names of the features that the network sees; None: all.
+      together: as members of one program, which share the batch order of `config`.
+    """
     normaliser = normaliser_of(frozen, config, keep)
+    members = [dataclasses.replace(config, seed=seed) for seed in seeds]
+    groups = [(config, members)] if together else [(one, [one]) for one in members]
     found = []
-    for seed in seeds:
-        own = dataclasses.replace(config, seed=seed)
-        fitted = fit(frozen, normaliser, own, members_of([own]))
-        one = jax.tree.map(lambda leaf: leaf[0], fitted)
-        found.append(_learned(one, normaliser, own))
+    for shared, group in groups:
+        fitted = fit(frozen, normaliser, shared, members_of(group))
+        for n, own in enumerate(group):
+            one = jax.tree.map(lambda leaf, n=n: leaf[n], fitted)
+            found.append(
+                Learned(
+                    params=one.params,
+                    normaliser=normaliser,
+                    config=own,
+                    loss=np.asarray(one.loss),
+                    wins=np.asarray(one.wins),
+                    finite=bool(one.finite),
+                )
+            )
     return found
-
-
-def _learned(one: Fitted, normaliser: Normaliser, config: TrainConfig) -> Learned:
-    return Learned(
-        params=one.params,
-        normaliser=normaliser,
-        config=config,
-        loss=np.asarray(one.loss),
-        wins=np.asarray(one.wins),
-        finite=bool(one.finite),
-    )
 
 
 def untrained(runs: Sequence[Learned]) -> list[Learned]:
     """Networks 21-15-1 before their first step, with the runs' inputs and seeds."""
-    nothing, made = np.zeros(0), []
+    nothing = {"loss": np.zeros(0), "wins": np.zeros(0)}
+    made = []
     for run in runs:
         config = dataclasses.replace(run.config, reward=RewardConfig(), loss="rank")
         params = init_state(config, run.normaliser).params
-        made.append(
-            dataclasses.replace(
-                run, params=params, config=config, loss=nothing, wins=nothing
-            )
-        )
+        made.append(dataclasses.replace(run, params=params, config=config, **nothing))
     return made
-
-
-def pair_wins(
-    frozen: FeatureBatch, runs: Sequence[Learned]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs that the positive wins (ties half), [R, S], and pairs [S]."""
-    won, feasible = [], np.asarray(frozen.feasible)
-    points, spread = np.asarray(frozen.points), np.asarray(frozen.points_valid)
-    for run in runs:
-        human = run.scorer(np.asarray(frozen.human), np.asarray(frozen.time_valid))
-        y = run.scorer(points, spread) - human[:, None]
-        won.append(np.sum(((y < 0.0) + 0.5 * (y == 0.0)) * feasible, axis=1))
-    return np.array(won), feasible.sum(axis=1)
 
 
 def train_learners(

@@ -80,29 +80,9 @@ class Outcomes:
     horizon_s: float = HORIZON_S  # s, horizon of the distances
     failure_m: float = FAILURE_M  # m, least FDE charged for a failure
 
-    def __post_init__(self) -> None:
-        """Refuse shapes that disagree and distances that are not finite."""
-        shape = np.shape(self.fde)
-        if len(shape) != 2 or min(shape) < 1:
-            raise InputError(
-                f"Outcomes: fde: shape {shape}: expected [S, K], not empty"
-            )
-        for name in ("ade", "crash", "feasible"):
-            _expect_shape("Outcomes", name, getattr(self, name), shape)
-        for name in ("cluster", "human_crash"):
-            _expect_shape("Outcomes", name, getattr(self, name), shape[:1])
-        for name in ("fde", "ade"):
-            if not np.all(np.isfinite(getattr(self, name))):
-                raise InputError(f"Outcomes: {name}: NaN or infinity: expected metres")
-        for name in ("horizon_s", "failure_m"):
-            if not getattr(self, name) > 0.0:
-                raise InputError(
-                    f"Outcomes: {name}: {getattr(self, name)}: expected more than 0"
-                )
-
 
 def miss_threshold(horizon_s: float) -> float:
-    """Largest FDE that is not a miss, m: a line through `MISS_LIMITS_M`."""
+    """Returns the largest FDE [m] that is no miss: a line through `MISS_LIMITS_M`."""
     (t0, t1), (d0, d1) = MISS_TIMES_S, MISS_LIMITS_M
     return d0 + (d1 - d0) * (horizon_s - t0) / (t1 - t0)
 
@@ -113,7 +93,7 @@ def scene_metrics(
     outcomes: Outcomes,
     temperature: float = 1.0,
 ) -> dict[str, np.ndarray]:
-    """All ranking metrics of one scorer, per scene.
+    """Returns all ranking metrics of one scorer, per scene.
 
     `percentile_rank` and `pairwise_accuracy` are the same share in a single
     scene: of the feasible candidates, those valued below the human, ties half.
@@ -147,14 +127,11 @@ def scene_metrics(
         miss: 1 where top1_fde is above `miss_threshold`; there 1.
     """
     values, human_value = _checked(values, human_value, outcomes)
-    if not (np.isfinite(temperature) and temperature > 0.0):
-        raise InputError(
-            f"scene_metrics: temperature: {temperature}: expected a number above 0"
-        )
-    some = np.asarray(np.any(outcomes.feasible, axis=1))
+    feasible = np.asarray(outcomes.feasible, bool)
+    count = np.sum(feasible, axis=1)
+    some = count > 0
     order = np.argsort(-values, axis=1, kind="stable")  # infeasible ones last
-    top = order[:, :TOP_COUNT]
-    chosen = np.where(some, order[:, 0], 0)
+    chosen, nearest = np.where(some, order[:, 0], 0), _nearest(outcomes)
     crash = (
         np.asarray(outcomes.crash, bool) & ~np.asarray(outcomes.human_crash)[:, None]
     )
@@ -163,24 +140,36 @@ def scene_metrics(
     charged = np.where(failed, np.maximum(fde, outcomes.failure_m), fde)
     top1_fde, chosen_crash = _pick(fde, chosen), _pick(crash, chosen)
     miss = (top1_fde > miss_threshold(outcomes.horizon_s)) | ~some
-    nearest = _nearest(outcomes)
-    return {
-        **_human_metrics(values, human_value, outcomes.feasible),
+    below = np.sum(feasible & (values < human_value[:, None]), axis=1)
+    equal = np.sum(feasible & (values == human_value[:, None]), axis=1)
+    share = (below + 0.5 * equal) / np.maximum(count, 1)
+    own = _pick(values, nearest)[:, None]
+    rank = np.sum(values > own, axis=1) + 0.5 * (np.sum(values == own, axis=1) + 1.0)
+    top = order[:, :TOP_COUNT]
+    # differences first: a large common offset must not cost digits
+    known = np.where(some[:, None], values, 0.0)
+    shifted = (1.0 / temperature) * (known - known.max(axis=1, keepdims=True))
+    found = {
+        "percentile_rank": share,
+        "pairwise_accuracy": share.copy(),
+        "num_pairs": np.maximum(count, 1),
+        "human_top1": (below == count) & (count > 0),
         "top1_fde": top1_fde,
         "top1_fde_failure": _pick(charged, chosen),
-        "top1_ade": _pick(np.asarray(outcomes.ade, np.float64), chosen),
-        "top3_fde": _best_of(fde, top, outcomes.feasible),
-        "top3_fde_failure": _best_of(charged, top, outcomes.feasible),
-        "mrr": np.where(some, 1.0 / _average_rank(values, nearest), 0.0),
-        "nll": _nll(values, nearest, some, 1.0 / temperature),
-        "crash_rate": chosen_crash.astype(np.float64),
-        "failure_rate": (chosen_crash | ~some).astype(np.float64),
-        "miss": miss.astype(np.float64),
+        "top1_ade": _pick(outcomes.ade, chosen),
+        "top3_fde": _best_of(fde, top, feasible),
+        "top3_fde_failure": _best_of(charged, top, feasible),
+        "mrr": np.where(some, 1.0 / rank, 0.0),
+        "nll": np.log(np.exp(shifted).sum(axis=1)) - _pick(shifted, nearest),
+        "crash_rate": chosen_crash,
+        "failure_rate": chosen_crash | ~some,
+        "miss": miss,
     }
+    return {name: np.asarray(x, np.float64) for name, x in found.items()}
 
 
 def random_scorer(seed: int, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Values of a scorer that knows nothing: uniform in [0, 1), Philox.
+    """Returns values of a scorer that knows nothing: uniform in [0, 1), Philox.
 
     Args:
       seed: non-negative; the same seed gives the same values everywhere.
@@ -195,14 +184,14 @@ def random_scorer(seed: int, shape: tuple[int, int]) -> tuple[np.ndarray, np.nda
 
 
 def oracle_fde(outcomes: Outcomes) -> np.ndarray:
-    """[S] m, FDE of the best feasible candidate; of candidate 0 if none is."""
+    """Returns [S] m, FDE of the best feasible candidate; of candidate 0 if none is."""
     fde = np.asarray(outcomes.fde, np.float64)
     order = np.broadcast_to(np.arange(fde.shape[1]), fde.shape)
     return _best_of(fde, order, outcomes.feasible)
 
 
 def oracle_scorer(outcomes: Outcomes) -> tuple[np.ndarray, np.ndarray]:
-    """Values [S, K] and [S] of a scorer that sees the FDE: the floor of top1_fde.
+    """Returns values [S, K] and [S] of a scorer that sees the FDE.
 
     V = -FDE, and 0 for the human. No scorer of the same candidates has a lower
     `top1_fde`; what is left is what the sampler cannot express.
@@ -212,7 +201,7 @@ def oracle_scorer(outcomes: Outcomes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fit_temperature(values: np.ndarray, outcomes: Outcomes) -> float:
-    """Temperature with the least mean NLL of the nearest candidate.
+    """Fits the temperature with the least mean NLL of the nearest candidate.
 
     With b = 1 / temperature, NLL(b) = mean[log sum_k exp(b v_k) - b v_nearest]
     is convex in b, and NLL'(b) = mean[E_b(v) - v_nearest] grows with b. Its root in
@@ -267,19 +256,14 @@ def fit_temperature(values: np.ndarray, outcomes: Outcomes) -> float:
     return float(spread * np.exp(-at))
 
 
-def _expect_shape(where: str, name: str, array: np.ndarray, shape: tuple) -> None:
-    if np.shape(array) != shape:
-        raise InputError(
-            f"{where}: {name}: shape {np.shape(array)}: expected {tuple(shape)}"
-        )
-
-
 def _checked(
     values: np.ndarray, human_value: np.ndarray, outcomes: Outcomes
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Float64 values with -inf at infeasible candidates, and the human's."""
-    _expect_shape("scorer", "values", values, np.shape(outcomes.fde))
-    _expect_shape("scorer", "human_value", human_value, np.shape(outcomes.fde)[:1])
+    """Returns float64 values with -inf at infeasible candidates, and the human's.
+
+    Raises:
+      InputError: a value of a feasible candidate or a human is NaN or infinite.
+    """
     human_value = np.asarray(human_value, np.float64)
     feasible = np.asarray(outcomes.feasible, bool)
     values = np.where(feasible, np.asarray(values, np.float64), -np.inf)
@@ -293,55 +277,19 @@ def _checked(
 
 
 def _pick(array: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """[S] the entry of each row at its index."""
+    """Returns [S], the entry of each row at its index."""
     return np.take_along_axis(array, index[:, None], axis=1)[:, 0]
 
 
 def _nearest(outcomes: Outcomes) -> np.ndarray:
-    """[S] index of the feasible candidate with the least ADE; 0 if none."""
+    """Returns [S], the index of the feasible one with the least ADE; 0 if none."""
     ade = np.where(outcomes.feasible, np.asarray(outcomes.ade, np.float64), np.inf)
     return np.argmin(ade, axis=1)
 
 
-def _human_metrics(
-    values: np.ndarray, human_value: np.ndarray, feasible: np.ndarray
-) -> dict[str, np.ndarray]:
-    """How the human ranks among the feasible; -inf values are the others."""
-    human = human_value[:, None]
-    below = np.sum(feasible & (values < human), axis=1)
-    equal = np.sum(feasible & (values == human), axis=1)
-    count = np.sum(feasible, axis=1)
-    share = (below + 0.5 * equal) / np.maximum(count, 1)
-    top = (below == count) & (count > 0)
-    return {
-        "percentile_rank": share,
-        "pairwise_accuracy": share.copy(),
-        "num_pairs": np.maximum(count, 1).astype(np.float64),
-        "human_top1": top.astype(np.float64),
-    }
-
-
 def _best_of(distance: np.ndarray, top: np.ndarray, feasible: np.ndarray) -> np.ndarray:
-    """[S] least distance of the feasible ones in `top`; candidate 0 if none."""
+    """Returns [S], the least of the feasible in `top`; of candidate 0 if none is."""
     taken = np.take_along_axis(distance, top, axis=1)
     allowed = np.take_along_axis(np.asarray(feasible, bool), top, axis=1)
     least = np.where(allowed, taken, np.inf).min(axis=1)
     return np.where(np.isfinite(least), least, distance[:, 0])
-
-
-def _average_rank(values: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """[S] rank from 1 of one candidate per scene; ties share the mean rank."""
-    own = _pick(values, index)[:, None]
-    above = np.sum(values > own, axis=1)
-    equal = np.sum(values == own, axis=1)
-    return above + 0.5 * (equal + 1.0)
-
-
-def _nll(
-    values: np.ndarray, nearest: np.ndarray, some: np.ndarray, beta: float
-) -> np.ndarray:
-    """[S] nats, -log softmax(beta values)[nearest]; log K where none is feasible."""
-    known = np.where(some[:, None], values, 0.0)
-    # differences first: a large common offset must not cost digits
-    shifted = beta * (known - known.max(axis=1, keepdims=True))
-    return np.log(np.exp(shifted).sum(axis=1)) - _pick(shifted, nearest)

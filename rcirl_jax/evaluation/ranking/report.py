@@ -6,10 +6,11 @@ runs), so rows can be compared; the comparison itself is the paired difference.
 """
 
 import dataclasses
+import functools
 import itertools
 import math
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -94,30 +95,31 @@ class RankingReport:
     num_resamples: int
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Ranked:
+    """All rows on the same S held-out scenes; what a report is made of."""
+
+    # row -> one `scene_metrics` per run, metric -> [S]
+    table: Mapping[str, Sequence[Mapping[str, np.ndarray]]]
+    outcomes: Outcomes
+    group: np.ndarray | None = None  # [S] int, vehicle-disjoint group, to be counted
+
+
 def build_report(
-    scorers: Mapping[str, Sequence[Mapping[str, np.ndarray]]],
-    outcomes: Outcomes,
-    *,
-    group: np.ndarray | None = None,
+    ranked: Ranked,
     references: Sequence[str] | None = None,
     num_resamples: int | None = None,
 ) -> RankingReport:
-    """Estimates with intervals, and paired differences, of several scorers.
-
-    A share that is 0 or 1 in every scene has no bootstrap spread. Its interval
-    is then the exact one-sided bound for vehicles, about 3 / vehicles: where a
-    share q of vehicles ever shows the event, at most about q of the scenes do.
+    """Estimates every row's metrics with intervals, and paired differences.
 
     Args:
-      scorers: row name -> one `scene_metrics` result per training run.
-      outcomes: the scenes' outcomes; its `cluster` is what is resampled.
-      group: [S] int, vehicle-disjoint group of each scene, to be counted.
+      ranked: the rows; the `cluster` of their outcomes is what is resampled.
       references: rows to compare with; by default those of `REFERENCES` present.
       num_resamples: bootstrap resamples; by default as many as it takes for the
-        largest family of differences to reach an adjusted p of `SMALLEST_P`.
+        largest family of differences to reach an adjusted p of `SMALLEST_P`:
+        m * 2 / (n + 1) <= `SMALLEST_P` for a family of m.
     """
-    if not scorers:
-        raise InputError("report: scorers: none: expected at least one row")
+    outcomes, scorers = ranked.outcomes, ranked.table
     if references is None:
         references = [name for name in REFERENCES if name in scorers]
     for name in references:
@@ -125,16 +127,53 @@ def build_report(
             raise InputError(
                 f"report: references: {name}: expected one of {', '.join(scorers)}"
             )
-    scenes = len(outcomes.cluster)
-    stacked = {name: _stack(name, runs, scenes) for name, runs in scorers.items()}
+    compared = [metric for metric, how in METRICS.items() if how.compared]
+    # one Holm family each: learned rows, and baselines, against a reference
+    families = [
+        (reference, [n for n in scorers if n != reference and is_baseline(n) == kind])
+        for reference in references
+        for kind in (False, True)
+    ]
     if num_resamples is None:
-        num_resamples = _enough_resamples(scorers, references)
+        largest = len(compared) * max((len(rows) for _, rows in families), default=0)
+        num_resamples = max(NUM_RESAMPLES, math.ceil(2 * largest / SMALLEST_P) - 1)
     bootstrap = ClusterBootstrap(outcomes.cluster, num_resamples)
-    resampled = _Resampled(stacked, bootstrap)
-    floor = oracle_fde(outcomes)
-    counts = {"scenes": scenes, "vehicles": bootstrap.num_clusters}
-    if group is not None:
-        counts["groups"] = int(np.unique(group).size)
+    stacked = {  # row -> metric -> [R, S]
+        name: {metric: np.stack([run[metric] for run in runs]) for metric in runs[0]}
+        for name, runs in scorers.items()
+    }
+
+    @functools.cache
+    def resampled(row: str, metric: str, stream: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns means of the runs [R], replicates [n] with runs of a stream."""
+        weight = METRICS[metric].weight
+        inputs = stacked[row][metric], stacked[row][weight][0] if weight else None
+        return bootstrap.mean(*inputs), bootstrap.means(*inputs, stream)
+
+    def compare(reference: str, rows: Sequence[str]) -> list[Comparison]:
+        """Compares a family of rows with one reference, in row then metric order."""
+        found = []
+        for row, metric in itertools.product(rows, compared):
+            (a, drawn), (b, others) = (
+                resampled(row, metric, 1),
+                resampled(reference, metric, 2),
+            )
+            difference = difference_of(float(a.mean() - b.mean()), drawn - others)
+            found.append((row, metric, difference))
+        adjusted = holm([difference.p for _, _, difference in found])
+        return [
+            Comparison(
+                row=row, reference=reference, metric=metric, difference=difference,
+                p_holm=float(p),
+                verdict=verdict(difference, p, METRICS[metric].higher_is_better),
+            )
+            for (row, metric, difference), p in zip(found, adjusted, strict=True)
+        ]  # fmt: skip
+
+    floor, vehicles = oracle_fde(outcomes), bootstrap.num_clusters
+    counts = {"scenes": len(outcomes.cluster), "vehicles": vehicles}
+    if ranked.group is not None:
+        counts["groups"] = int(np.unique(ranked.group).size)
     counts["candidates"] = int(np.size(outcomes.feasible))
     counts["feasible"] = int(np.sum(outcomes.feasible))
     return RankingReport(
@@ -144,15 +183,18 @@ def build_report(
         counts=counts,
         runs={name: len(runs) for name, runs in scorers.items()},
         rows={
-            name: {metric: _estimate(resampled, name, metric) for metric in METRICS}
-            for name in stacked
+            name: {
+                metric: _bounded(
+                    estimate_of(*resampled(name, metric, 1)),
+                    values[metric],
+                    METRICS[metric].unit,
+                    vehicles,
+                )
+                for metric in METRICS
+            }
+            for name, values in stacked.items()
         },
-        comparisons=tuple(
-            comparison
-            for name in references
-            for family in _families(scorers, name)
-            for comparison in _compare(resampled, family, name)
-        ),
+        comparisons=tuple(c for family in families for c in compare(*family)),
         human_rank_median={
             name: bootstrap_median(
                 np.mean(values["percentile_rank"], axis=0), bootstrap
@@ -166,127 +208,50 @@ def build_report(
     )
 
 
-def _stack(
-    name: str, runs: Sequence[Mapping[str, np.ndarray]], scenes: int
-) -> dict[str, np.ndarray]:
-    """Metric -> [R, S]."""
-    needed = [*METRICS, *{m.weight for m in METRICS.values() if m.weight}]
-    if not runs:
-        raise InputError(f"report: {name}: no runs: expected at least one")
-    stacked = {}
-    for metric in needed:
-        columns = [np.asarray(run.get(metric), np.float64) for run in runs]
-        if any(column.shape != (scenes,) for column in columns):
-            raise InputError(
-                f"report: {name}: {metric}: missing, or not of {scenes} scenes:"
-                " expected a result of scene_metrics in every run"
-            )
-        stacked[metric] = np.stack(columns)
-    return stacked
+def is_baseline(row: str) -> bool:
+    """Returns whether a row is not learned."""
+    return row in BASELINE_ROWS
 
 
-def _weight(values: Mapping[str, np.ndarray], metric: str) -> np.ndarray | None:
-    weight = METRICS[metric].weight
-    return None if weight is None else values[weight][0]
+def _bounded(found: Estimate, values: np.ndarray, unit: str, vehicles: int) -> Estimate:
+    """Returns the estimate of a share with an interval within 0 and 1.
 
+    A share that is 0 or 1 in every scene has no bootstrap spread. Its interval is
+    then the exact one-sided bound for vehicles, about 3 / vehicles: where a share q
+    of vehicles ever shows the event, at most about q of the scenes do.
 
-class _Resampled:
-    """Means of rows over the resamples, made once for rows and differences."""
-
-    def __init__(
-        self,
-        stacked: Mapping[str, Mapping[str, np.ndarray]],
-        bootstrap: ClusterBootstrap,
-    ) -> None:
-        self.stacked, self.bootstrap = stacked, bootstrap
-        self._means: dict[tuple[str, str, int], tuple[np.ndarray, np.ndarray]] = {}
-
-    def means(
-        self, row: str, metric: str, stream: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Means of the runs [R], and replicates [n] with runs drawn from `stream`."""
-        key = (row, metric, stream)
-        if key not in self._means:
-            values = self.stacked[row]
-            inputs = (values[metric], _weight(values, metric))
-            means = self.bootstrap.mean(*inputs)
-            self._means[key] = (means, self.bootstrap.means(*inputs, stream))
-        return self._means[key]
-
-    def difference(self, row: str, reference: str, metric: str) -> Difference:
-        """`paired_difference` of two rows."""
-        means, replicates = self.means(row, metric, 1)
-        other, others = self.means(reference, metric, 2)
-        mean = float(means.mean() - other.mean())
-        return difference_of(mean, replicates - others)
-
-
-def _estimate(resampled: _Resampled, row: str, metric: str) -> Estimate:
-    found = estimate_of(*resampled.means(row, metric, 1))
-    if METRICS[metric].unit != "%":
+    Args:
+      found: with its bootstrap interval.
+      values: [R, S].
+      unit: only shares, "%", are changed.
+      vehicles: number of clusters.
+    """
+    if unit != "%":
         return found
-    values = resampled.stacked[row]
-    vehicles = resampled.bootstrap.num_clusters
     # the other end is certain, so all of the error probability goes to this one
     two_sided = 2.0 * CONFIDENCE - 1.0
-    if np.all(values[metric] == 0.0):
-        high = clopper_pearson(0, vehicles, two_sided)[1]
-        return dataclasses.replace(found, value=0.0, low=0.0, high=high, exact=True)
-    if np.all(values[metric] == 1.0):
-        low = clopper_pearson(vehicles, vehicles, two_sided)[0]
-        return dataclasses.replace(found, value=1.0, low=low, high=1.0, exact=True)
+    for end in (0.0, 1.0):
+        if np.all(values == end):
+            low, high = clopper_pearson(int(end) * vehicles, vehicles, two_sided)
+            return dataclasses.replace(found, value=end, low=low, high=high, exact=True)
     # stretched run weights can push an end of a share over 0 or 1
     low, high = max(found.low, 0.0), min(found.high, 1.0)
     return dataclasses.replace(found, low=low, high=high)
 
 
-def _families(names: Iterable[str], reference: str) -> list[list[str]]:
-    """Learned rows, then baselines, without the reference: one Holm family each."""
-    others = [name for name in names if name != reference]
-    learned = [name for name in others if name not in BASELINE_ROWS]
-    return [learned, [name for name in others if name in BASELINE_ROWS]]
-
-
-def _enough_resamples(names: Iterable[str], references: Sequence[str]) -> int:
-    """Resamples n with m * 2 / (n + 1) <= `SMALLEST_P` for the largest family of m."""
-    per_row = sum(how.compared for how in METRICS.values())
-    families = [part for name in references for part in _families(names, name)]
-    largest = per_row * max(map(len, families), default=0)
-    return max(NUM_RESAMPLES, math.ceil(2 * largest / SMALLEST_P) - 1)
-
-
-def _compare(
-    resampled: _Resampled, rows: Sequence[str], reference: str
-) -> list[Comparison]:
-    """One family of rows against one reference, in row then metric order."""
-    pairs = [(row, m) for row in rows for m, how in METRICS.items() if how.compared]
-    found = [resampled.difference(row, reference, metric) for row, metric in pairs]
-    adjusted = holm(np.array([difference.p for difference in found]))
-    return [
-        Comparison(
-            row=row,
-            reference=reference,
-            metric=metric,
-            difference=difference,
-            p_holm=float(p),
-            verdict=verdict(difference, p, METRICS[metric].higher_is_better),
-        )
-        for (row, metric), difference, p in zip(pairs, found, adjusted, strict=True)
-    ]
-
-
 def verdict(difference: Difference, p_holm: float, higher_is_better: bool) -> str:
-    """Name a difference "better" or "worse" if its adjusted p is small, else not."""
+    """Names a difference "better" or "worse" if its adjusted p is small, else not."""
     if p_holm >= SIGNIFICANT:
         return "no difference"
     return "better" if (difference.mean > 0.0) == higher_is_better else "worse"
 
 
 def to_json(report: RankingReport) -> dict:
-    """The report as plain JSON types: finite numbers, text, true/false and null.
+    """Returns the report as plain JSON types.
 
-    `seed_sd` and `seed_se` are null for a single run. Shares are in [0, 1]. Numbers
-    have `DIGITS` significant digits.
+    They are finite numbers, text, true, false and null. `seed_sd` and `seed_se` are
+    null for a single run. Shares are in [0, 1]. Numbers have `DIGITS` significant
+    digits.
     """
     content = {
         "schema": SCHEMA,
@@ -305,7 +270,7 @@ def to_json(report: RankingReport) -> dict:
 
 
 def from_json(body: Mapping[str, Any]) -> RankingReport:
-    """The report of `to_json`.
+    """Reads the report of `to_json`.
 
     Raises:
       InputError: another schema, or a field that is missing or of another kind.
@@ -319,7 +284,7 @@ def from_json(body: Mapping[str, Any]) -> RankingReport:
 
 
 def _plain(node: object, where: str) -> "dict | list | str | float | int | bool | None":
-    """JSON types only; a number that is not finite is an error that names itself."""
+    """Returns JSON types only; a number that is not finite is refused by its name."""
     if isinstance(node, Mapping):
         return {str(k): _plain(v, f"{where}.{k}") for k, v in node.items()}
     if isinstance(node, list | tuple):
@@ -335,21 +300,15 @@ def _plain(node: object, where: str) -> "dict | list | str | float | int | bool 
 # ---------------------------------------------------------------- text
 
 _IN_MARKDOWN = (
-    "top1_fde",
-    "top1_fde_failure",
-    "top3_fde",
-    "top1_ade",
-    "mrr",
-    "nll",
-    "percentile_rank",
-    "crash_rate",
+    *("top1_fde", "top1_fde_failure", "top3_fde", "top1_ade"),
+    *("mrr", "nll", "percentile_rank", "crash_rate"),
 )
 
 
 def format_table(
     report: RankingReport, width: int = 110, *, differences: bool = True
 ) -> str:
-    """The report as aligned plain text for a terminal.
+    """Formats the report as aligned plain text for a terminal.
 
     Rows: learned scorers first, then the baselines; columns wrap into blocks that
     fit. A share of 0 or 100 % is printed with its exact bound. Below: learned
@@ -363,7 +322,7 @@ def format_table(
     if width < MIN_WIDTH:
         raise InputError(f"format_table: width: {width}: expected at least {MIN_WIDTH}")
     names = _order(report)
-    learned = [name for name in names if name not in BASELINE_ROWS]
+    learned = [name for name in names if not is_baseline(name)]
     lines = [line for text in _heading(report) for line in textwrap.wrap(text, width)]
     grid, block = _grid(report, names), [0]
     for column in range(1, len(grid[0])):
@@ -378,13 +337,13 @@ def format_table(
 
 
 def _columns(grid: Sequence[Sequence[str]], which: Sequence[int]) -> list[str]:
-    """Lines of some columns of a table."""
+    """Formats some columns of a table as lines."""
     head, *rows = [[row[i] for i in which] for row in grid]
     return text_table(head, rows)
 
 
 def _grid(report: RankingReport, names: Sequence[str]) -> list[list[str]]:
-    """Titles, units, then a row's cells and, of several runs, their spread."""
+    """Returns titles, units, each row's cells and, of several runs, their spread."""
     kinds = [*METRICS.values(), METRICS["percentile_rank"]]
     titles = [how.title for how in kinds]
     titles[-1] = f"{titles[-1]}, median"
@@ -407,11 +366,8 @@ def _differences(report: RankingReport, names: Sequence[str]) -> list[str]:
     shown = [c for c in report.comparisons if c.row in names]
     if not shown:
         return []
-    lines = [
-        "",
-        "Paired differences on the same scenes; named where Holm's p is below "
-        f"{SIGNIFICANT:g}",
-    ]
+    words = "Paired differences on the same scenes; named where Holm's p is below "
+    lines = ["", f"{words}{SIGNIFICANT:g}"]
     for pair, group in itertools.groupby(shown, lambda c: (c.row, c.reference)):
         first, *others = [_difference(c) for c in group]
         lines += [" minus ".join(pair), *text_table(first, others)]
@@ -432,7 +388,7 @@ def _difference(found: Comparison) -> list[str]:
 
 
 def markdown_table(report: RankingReport, against: str = "GAN") -> str:
-    """The report's main columns as one Markdown table, a line per row.
+    """Formats the report's main columns as one Markdown table, a line per row.
 
     The last column is the paired difference in top-1 FDE to the row `against`, if
     there is one, with its p value by Holm's correction over the learned rows (the
@@ -456,8 +412,8 @@ def markdown_table(report: RankingReport, against: str = "GAN") -> str:
 
 
 def _order(report: RankingReport) -> list[str]:
-    """Learned rows first, then the baselines in their order."""
-    learned = [name for name in report.rows if name not in BASELINE_ROWS]
+    """Returns learned rows first, then the baselines in their order."""
+    learned = [name for name in report.rows if not is_baseline(name)]
     return [*learned, *(name for name in BASELINE_ROWS if name in report.rows)]
 
 
@@ -497,7 +453,7 @@ def _cell(found: Estimate, unit: str) -> str:
 
 
 def _number(value: float, unit: str) -> str:
-    """Fixed digits; a share that is not 0 or 100 % is never printed as if it were."""
+    """Formats fixed digits; only a share of 0 or 100 % is printed as one."""
     if unit != "%":
         return f"{value:.2f}" if unit == "m" else f"{value:.3f}"
     percent = 100.0 * value

@@ -213,18 +213,17 @@ def test_temperature_stays_finite_at_both_ends():
 def test_bad_input_is_one_clear_line():
     o = make(1)
     values, human = random_scorer(0, o.fde.shape)
-    broken = values.copy()
-    broken[4] = np.nan
     o = dataclasses.replace(o, feasible=np.ones_like(o.feasible))
-    nothing = dataclasses.replace(o, feasible=np.zeros_like(o.feasible))
-    nan = np.where(o.crash, np.nan, o.fde)
-    for work, says in (
-        (lambda: scene_metrics(broken, human, o), "infinity in 1 scenes, first 4"),
-        (lambda: scene_metrics(values[:, :2], human, o), "values: shape"),
-        (lambda: scene_metrics(values, human, o, 0.0), "temperature"),
-        (lambda: dataclasses.replace(o, ade=o.ade[:2]), "ade: shape"),
-        (lambda: dataclasses.replace(o, fde=nan), "fde: NaN"),
-        (lambda: fit_temperature(values, nothing), "no scene has a candidate"),
+    for broken, unknown in (
+        (np.nan, human),
+        (np.inf, human),
+        (0.5, np.full(30, np.nan)),
     ):
-        with pytest.raises(InputError, match=says):
-            work()
+        wrong = values.copy()
+        wrong[4:, 0] = broken
+        first = 0 if np.isnan(unknown).any() else 4
+        with pytest.raises(InputError, match=f"scenes, first {first}"):
+            scene_metrics(wrong, unknown, o)
+    nothing = dataclasses.replace(o, feasible=np.zeros_like(o.feasible))
+    with pytest.raises(InputError, match="no scene has a candidate"):
+        fit_temperature(values, nothing)
