@@ -18,7 +18,6 @@ from absl import flags
 from experiments.known_drivers import made_rows, table, tallied, with_faults
 from rcirl_jax.cli import flags as shared
 from rcirl_jax.cli.running import provenance, run
-from rcirl_jax.evaluation.closed_loop.runs import runs_of
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite
 from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.simulation.suite import catalogue_set, suite_refs
@@ -38,7 +37,7 @@ def main() -> None:
     seeds, asked = _SEEDS.value, (_SUITE.value, _CASES.value)
     refs = [ref for seed in range(seeds) for ref in suite_refs(*asked, seed)]
     cases = catalogue_set(refs, _DURATION.value)
-    runs = with_faults(runs_of(run_suite(made_rows(), cases, SuiteConfig())))
+    runs = with_faults(run_suite(made_rows(), cases, SuiteConfig()))
     config = dataclasses.replace(_MARGINS(), trivial_baselines=())  # for recordings
     found = tallied(runs, seeds, config)
     body = {"cases": len(refs), "seeds": seeds, "kinds": found, "config": config}

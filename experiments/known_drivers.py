@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from rcirl_jax.evaluation.closed_loop.runs import SuiteRuns
-from rcirl_jax.evaluation.closed_loop.summary import text_table
+from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns, text_table
 from rcirl_jax.evaluation.gate import types as gate
 from rcirl_jax.evaluation.gate.verdict import MIN_CLUSTERS, judge, pair_of
 from rcirl_jax.evaluation.statistics import clopper_pearson

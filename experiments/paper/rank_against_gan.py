@@ -276,7 +276,7 @@ def driven(files: Mapping[str, str], cases: int, duration: float) -> dict[str, C
     rows = table_rows([*files.values()], BASELINES, names=[*files])
     refs = suite_refs(which, cases, _SEED.value)
     result = run_suite(rows, catalogue_set(refs, duration), SuiteConfig())
-    count, own = len(refs), np.mean(result.runs[OWN_COST].progress)
+    count, own = len(refs), np.mean(result.rows[OWN_COST].progress)
 
     def measures(m: CaseMetrics) -> dict[str, ArrayLike]:
         return {
@@ -289,7 +289,7 @@ def driven(files: Mapping[str, str], cases: int, duration: float) -> dict[str, C
             "red lights": count * m.red_lights,
         }
 
-    found = {name: measures(m) for name, m in result.runs.items()}
+    found = {name: measures(m) for name, m in result.rows.items()}
     cluster = family_clusters(result.cases.groups)
     return {
         key: column({name: x[key] for name, x in found.items()}, cluster)

@@ -23,7 +23,6 @@ from rcirl_jax.evaluation.closed_loop.likeness import (
     LikenessReport,
     held_out_likeness,
 )
-from rcirl_jax.evaluation.closed_loop.runs import runs_of
 from rcirl_jax.evaluation.closed_loop.suite import (
     DriveRow,
     SuiteConfig,
@@ -373,7 +372,7 @@ def judged(
         recorded = held_out(sources, drives)
         report = held_out_likeness(recorded, job.rows(), job.plan_every)
     known = None if report is None else report.likeness
-    pair = pair_of(runs_of(result), incumbent, config.trivial_baselines, known)
+    pair = pair_of(result, incumbent, config.trivial_baselines, known)
     verdict = judge(pair, config, left_out(job))
     return Judged(verdict=verdict, likeness=report, facts=result.facts)
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from markupsafe import Markup
 
-from rcirl_jax.evaluation.closed_loop.runs import SuiteRuns
+from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns
 from rcirl_jax.report.pages import Table, facts_text, part, write_page
 from rcirl_jax.report.replays import Replay, broken_bounds, goes_as
 from rcirl_jax.report.style import CANDIDATE, CLASS_COLOURS, HUMAN_LOOK, LOOKS, Look

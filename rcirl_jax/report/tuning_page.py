@@ -10,7 +10,6 @@ import tqdm
 
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.store.dataset import Dataset, Demonstrations
-from rcirl_jax.evaluation.closed_loop.runs import SuiteRuns
 from rcirl_jax.evaluation.closed_loop.summary import (
     PAPER,
     SHORT,
@@ -18,6 +17,8 @@ from rcirl_jax.evaluation.closed_loop.summary import (
     RowSummary,
     SuiteComparison,
     SuiteReport,
+    SuiteRuns,
+    summarise,
 )
 from rcirl_jax.evaluation.gate.types import Check, GateConfig, Verdict
 from rcirl_jax.evaluation.gate.words import OUTCOMES, RANKS, TITLES
@@ -112,7 +113,7 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
     Raises:
       InputError: a held-out split with fewer than two vehicles.
     """
-    suite, workdir = report.suite.report(), report.workdir
+    suite, workdir = summarise(report.suite), report.workdir
     reward = next(iter(report.rewards.values()))
     sampler = SamplerConfig(mode=str(reward.provenance.get("mode", "speed")))
     quality = ""

@@ -16,13 +16,9 @@ from rcirl_jax.evaluation.closed_loop.likeness import (
     read_arrays,
     write_arrays,
 )
-from rcirl_jax.evaluation.closed_loop.runs import (
-    SuiteRuns,
-    read_runs,
-    runs_of,
-    write_runs,
-)
+from rcirl_jax.evaluation.closed_loop.runs import read_runs, write_runs
 from rcirl_jax.evaluation.closed_loop.suite import write_suite
+from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns
 from rcirl_jax.evaluation.gate.types import CANDIDATE, INCUMBENT, Verdict
 from rcirl_jax.evaluation.gate.verdict import judge, pair_of, write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
@@ -242,7 +238,7 @@ def simulate(run: Run, sources: Sequence[Dataset]) -> None:
     def drive() -> None:
         result = drive_job(job, run.executor)
         write_suite(result, folder, run.provenance())
-        write_runs(folder / "metrics.npz", runs_of(result))
+        write_runs(folder / "metrics.npz", result)
 
     names = ("metrics.npz", "suite.json", "cases.csv", "table.txt")
     run.stage("simulate", {"job": decides}, [folder / name for name in names], drive)

@@ -13,7 +13,7 @@ from rcirl_jax.evaluation.closed_loop.suite import (
     worst_cases,
     write_suite,
 )
-from rcirl_jax.evaluation.closed_loop.summary import summarise
+from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns, summarise
 from rcirl_jax.planner.baselines import Idm, Yielding
 from rcirl_jax.simulation.metrics import COLUMNS
 from rcirl_jax.simulation.rows import rule_row
@@ -39,7 +39,7 @@ def test_rates_are_those_of_the_metrics(result):
     assert report.cases == 6
     assert set(report.rows) == {row.name for row in ROWS}
     for name, row in report.rows.items():
-        metrics = result.runs[name]
+        metrics = result.rows[name]
         for i, column in enumerate(COLUMNS):
             found = row.per_case[column]
             assert (found.k, found.n) == (metrics.holds[:, i].sum(), 6)
@@ -59,16 +59,21 @@ def test_starts_are_the_cases_with_one():
     runs["IDM"] = some.replace(start_time=seconds)
     flags, way = np.zeros(seconds.size, bool), np.full(seconds.size, 1000.0)
     names = [f"family {i % 2}" for i in range(seconds.size)]
-    report = summarise(runs, names, flags, flags, "IDM", way)
+    report = summarise(
+        SuiteRuns(
+            rows=runs, ids=(), groups=tuple(names), preventable=flags, trivial=flags,
+            reference="IDM", way=way,
+        )
+    )  # fmt: skip
     found = {name: row.physical for name, row in report.rows.items()}
     assert [found[name]["starts"] for name in runs] == [0, 3]
     assert [found[name]["start_s_median"] for name in runs] == [-1.0, 5.5]
 
 
 def test_differences_are_paired(result):
-    first = result.runs["careful"].holds
+    first = result.rows["careful"].holds
     for item in result.report.comparisons:
-        other = result.runs[item.b].holds
+        other = result.rows[item.b].holds
         for i, (wins, losses, p, adjusted) in enumerate(item.columns.values()):
             assert wins == (first[:, i] & ~other[:, i]).sum()
             assert losses == (~first[:, i] & other[:, i]).sum()
@@ -78,9 +83,9 @@ def test_differences_are_paired(result):
 def test_differences_over_families_are_those_of_family_means(result):
     """Two families of three cases each: Student's t with one degree of freedom."""
     groups = np.asarray(result.cases.groups)
-    first = result.runs["careful"]
+    first = result.rows["careful"]
     for item in result.report.comparisons:
-        other = result.runs[item.b]
+        other = result.rows[item.b]
         apart = np.subtract(first.progress, other.progress, dtype=float)
         means = [apart[groups == name].mean() for name in np.unique(groups)]
         found = scipy.stats.ttest_1samp(means, 0.0)
@@ -104,7 +109,7 @@ def test_files_say_the_same(result, tmp_path):
         rows = list(csv.DictReader(file))
     assert len(rows) == 6 * len(ROWS)
     faults = [int(r["at_fault"]) for r in rows if r["row"] == "constant speed"]
-    np.testing.assert_array_equal(faults, result.runs["constant speed"].at_fault)
+    np.testing.assert_array_equal(faults, result.rows["constant speed"].at_fault)
     assert {r["case"] for r in rows} == set(result.cases.ids)
     worst = worst_cases(result, "constant speed", 3)
     assert all(name.startswith("stopped_lead/") for name in worst)

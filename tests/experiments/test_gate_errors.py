@@ -18,7 +18,7 @@ from experiments.known_drivers import (
     tallied,
     with_faults,
 )
-from rcirl_jax.evaluation.closed_loop.runs import SuiteRuns
+from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns
 from rcirl_jax.evaluation.gate.types import GateConfig
 from tests.evaluation.gate.test_gate import CASES, broken, drives, pair
 from tests.helpers.commands import succeeded

@@ -7,7 +7,7 @@ import numpy as np
 
 from rcirl_jax.data.importing import import_logs
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.evaluation.closed_loop.runs import SuiteRuns
+from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns
 from rcirl_jax.evaluation.gate.types import GateConfig, Pair
 from rcirl_jax.evaluation.gate.verdict import judge
 from rcirl_jax.evaluation.ranking.metrics import Outcomes, random_scorer, scene_metrics

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop.suite import SuiteResult
-from rcirl_jax.evaluation.closed_loop.summary import SuiteReport, summarise
+from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns
 from rcirl_jax.runtime.atomic_files import is_text, write_whole
 from rcirl_jax.simulation.metrics import CaseMetrics
 
@@ -34,7 +33,7 @@ DAMAGED = (
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Arrays by name as a packed file, whole or not at all."""
+    """Writes arrays by name as a packed file, whole or not at all."""
     packed = io.BytesIO()
     np.savez_compressed(packed, allow_pickle=False, **arrays)
     write_whole(path, packed.getvalue())
@@ -42,7 +41,7 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 @contextlib.contextmanager
 def read_npz(path: Path, expected: str) -> Iterator[dict[str, Any]]:
-    """The arrays of a file by name; what the block makes of them is checked as well.
+    """Reads the arrays of a file by name; checks what the block makes of them too.
 
     Args:
       path: the file.
@@ -72,7 +71,7 @@ def check_array(
 
 
 def names_of_rows(found: np.ndarray) -> list[str]:
-    """Texts [rows], checked first: a file may claim 2**40 empty ones in no bytes.
+    """Returns texts [rows], checked: a file may claim 2**40 empty ones in no bytes.
 
     Raises:
       ValueError: another array, or a name that is there twice.
@@ -86,7 +85,7 @@ def names_of_rows(found: np.ndarray) -> list[str]:
 
 
 def _arrays(path: Path) -> dict[str, Any]:
-    """The arrays of the archive; what it would unpack to is checked first."""
+    """Reads the arrays of the archive; what it would unpack to is checked first."""
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         if any(member.compress_type not in PACKINGS for member in members):
@@ -130,45 +129,8 @@ COLUMNS = {  # metrics of several numbers a case
 }
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SuiteRuns:
-    """Metrics of all rows on the same C cases."""
-
-    rows: Mapping[str, CaseMetrics]  # leaves [C, ...]
-    ids: tuple[str, ...]
-    groups: tuple[str, ...]
-    preventable: np.ndarray  # [C] bool
-    trivial: np.ndarray  # [C] bool
-    reference: str  # who sets the distance
-    way: np.ndarray  # [C] m, how far it got
-
-    def report(self) -> SuiteReport:
-        """The table."""
-        return summarise(
-            self.rows,
-            self.groups,
-            self.preventable,
-            self.trivial,
-            self.reference,
-            self.way,
-        )
-
-
-def runs_of(result: SuiteResult) -> SuiteRuns:
-    """The part of a driven suite that is stored."""
-    return SuiteRuns(
-        rows=result.runs,
-        ids=result.cases.ids,
-        groups=result.cases.groups,
-        preventable=result.preventable,
-        trivial=result.trivial,
-        reference=result.reference,
-        way=result.way,
-    )
-
-
 def write_runs(path: Path, runs: SuiteRuns) -> None:
-    """Write the file, atomically."""
+    """Writes the file, atomically."""
     arrays = {
         "names": np.array(list(runs.rows)),
         "ids": np.array(runs.ids),
@@ -179,51 +141,34 @@ def write_runs(path: Path, runs: SuiteRuns) -> None:
         "way": np.asarray(runs.way),
     }
     for number, metrics in enumerate(runs.rows.values()):
-        for field in dataclasses.fields(CaseMetrics):
-            value = np.asarray(getattr(metrics, field.name))
-            arrays[f"row{number}.{field.name}"] = value
+        for name, value in vars(metrics).items():
+            arrays[f"row{number}.{name}"] = np.asarray(value)
     write_npz(path, arrays)
 
 
-def _check_arrays(arrays: Mapping[str, np.ndarray], rows: int) -> None:
-    """Check shapes and kinds: numbers [C, ...] as `CaseMetrics` says, texts [C].
-
-    Raises:
-      ValueError, KeyError: another one (names the array).
-    """
-    numbers, texts, flags = "biuf", "U", "b"
-    wanted = {
-        "reference": (texts, ()),
-        **dict.fromkeys(("ids", "groups"), (texts, (len(arrays["ids"]),))),
-        **dict.fromkeys(("preventable", "trivial"), (flags, (len(arrays["ids"]),))),
-        "way": (numbers, (len(arrays["ids"]),)),
-    }
-    for number in range(rows):
-        for field in dataclasses.fields(CaseMetrics):
-            shape = (len(arrays["ids"]), *COLUMNS.get(field.name, ()))
-            wanted[f"row{number}.{field.name}"] = numbers, shape
-    for name, (kinds, shape) in wanted.items():
-        check_array(arrays, name, kinds, shape)
-
-
 def read_runs(path: Path) -> SuiteRuns:
-    """The suite of a file.
+    """Reads the suite of a file.
 
     Raises:
       InputError: missing, damaged, or not such a file.
     """
+    numbers, texts, flags = "biuf", "U", "b"
     with read_npz(path, "the metrics of a suite") as arrays:
-        names = names_of_rows(arrays["names"])
-        rows = {
-            name: CaseMetrics(
-                **{
-                    field.name: arrays[f"row{number}.{field.name}"]
-                    for field in dataclasses.fields(CaseMetrics)
-                }
-            )
-            for number, name in enumerate(names)
-        }
-        _check_arrays(arrays, len(names))
+        names, count = names_of_rows(arrays["names"]), len(arrays["ids"])
+        fields = [field.name for field in dataclasses.fields(CaseMetrics)]
+        check_array(arrays, "reference", texts, ())
+        check_array(arrays, "way", numbers, (count,))
+        for name in ("ids", "groups"):
+            check_array(arrays, name, texts, (count,))
+        for name in ("preventable", "trivial"):
+            check_array(arrays, name, flags, (count,))
+        rows = {}
+        for number, name in enumerate(names):
+            for field in fields:
+                shape = (count, *COLUMNS.get(field, ()))
+                check_array(arrays, f"row{number}.{field}", numbers, shape)
+            values = {field: arrays[f"row{number}.{field}"] for field in fields}
+            rows[name] = CaseMetrics(**values)
         return SuiteRuns(
             rows=rows,
             ids=tuple(arrays["ids"].tolist()),

@@ -12,6 +12,7 @@ import tqdm
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.summary import (
     SuiteReport,
+    SuiteRuns,
     format_families,
     format_suite,
     result_hash,
@@ -55,17 +56,11 @@ DriveRow = Callable[[Row, CaseSet, SuiteConfig], CaseMetrics]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SuiteResult:
+class SuiteResult(SuiteRuns):
     """All results of a driven suite."""
 
     report: SuiteReport
-    runs: Mapping[str, CaseMetrics]
     cases: CaseSet
-    preventable: np.ndarray
-    trivial: np.ndarray
-    # who sets the distance of the progress, and how far it got [C]
-    reference: str
-    way: np.ndarray
     # by row: seconds, plans per second, steps between plans
     timings: Mapping[str, Mapping[str, float]]
     facts: Mapping[str, object]  # hashes, memory
@@ -148,17 +143,20 @@ def run_suite(
             "plan_every_steps": steps,
         }
     reference = RECORDED_HUMAN if RECORDED_HUMAN in runs else "IDM"
-    way = np.asarray(driven[reference].progress)
-    report = summarise(runs, cases.groups, avoidable, calm, reference, way)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    return SuiteResult(
-        report=report,
-        runs=runs,
-        cases=cases,
+    driven_runs = SuiteRuns(
+        rows=runs,
+        ids=cases.ids,
+        groups=cases.groups,
         preventable=avoidable,
         trivial=calm,
         reference=reference,
-        way=way,
+        way=np.asarray(driven[reference].progress),
+    )
+    return SuiteResult(
+        **vars(driven_runs),
+        report=summarise(driven_runs),
+        cases=cases,
         timings=timings,
         facts={
             "duration_s": cases.duration_s,
@@ -173,24 +171,18 @@ def write_suite(
     result: SuiteResult, folder: Path, provenance: Mapping[str, object]
 ) -> str:
     """suite.json, cases.csv, table.txt in a folder; returns the table."""
-    first = next(iter(result.runs))
+    first = next(iter(result.rows))
     text = format_suite(result.report) + "\n" + format_families(result.report, first)
     write_whole(folder / "table.txt", text)
     facts = {**result.facts, "timings": result.timings, "made_by": provenance}
     write_json(folder / "suite.json", {**facts, "report": result.report})
-    write_csv(
-        folder / "cases.csv",
-        result.runs,
-        result.cases.ids,
-        result.preventable,
-        result.cases.parameters,
-    )
+    write_csv(folder / "cases.csv", result, result.cases.parameters)
     return text
 
 
 def worst_cases(result: SuiteResult, row: str, count: int = 10) -> list[str]:
     """Ids of the cases of a row to look at first: faults, red lights, low progress."""
-    metrics = result.runs[row]
+    metrics = result.rows[row]
     key = (
         1000.0 * (np.asarray(metrics.at_fault) > 0)
         + 100.0 * (np.asarray(metrics.red_lights) > 0)

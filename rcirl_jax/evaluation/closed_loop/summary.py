@@ -11,7 +11,7 @@ import csv
 import dataclasses
 import hashlib
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rcirl_jax.evaluation.statistics import (
-    ClusterBootstrap,
     Difference,
     clopper_pearson,
     cluster_t,
+    combine_seeds,
     family_clusters,
     holm,
     mcnemar_exact,
@@ -35,6 +35,53 @@ PAPER = {
     "the paper, RC-IRL": (100.0, 100.0, 99.33, 99.97, 97.77, 82.77),
     "the paper, GAN": (100.0, 99.49, 86.80, 99.97, 71.20, 82.57),
 }
+
+
+# means and worst values of a row: name -> field of the metrics, how
+PHYSICAL: dict[str, tuple[str, Callable[[np.ndarray], np.floating]]] = {
+    "rms_a": ("rms_a", np.mean),
+    "rms_j": ("rms_j", np.mean),
+    "worst_a": ("min_a", np.min),
+    "worst_j": ("max_j", np.max),
+    # the 5 % quantile, in which "never" (inf) counts as large
+    "min_ttc_p5": ("min_ttc", lambda x: np.quantile(np.minimum(x, 1e3), 0.05)),
+    "min_headway_p5": ("min_headway", lambda x: np.quantile(np.minimum(x, 1e3), 0.05)),
+    "tet_s": ("tet", np.mean),
+    "induced_over_4": ("induced_braking", lambda x: np.mean(x > 4.0)),
+    "brake_taps": ("brake_taps", np.mean),
+    "fallback_share": ("fallback_share", np.mean),
+    "standing_share": ("standing_share", np.mean),
+    "creeping_share": ("creeping_share", np.mean),
+    "sign_changes_per_s": ("sign_changes", np.mean),
+    # cases with a start on a free road, and the median of theirs, s; -1 if none
+    "starts": ("start_time", lambda x: np.sum(x >= 0.0)),
+    "start_s_median": (
+        "start_time",
+        lambda x: np.median(x[x >= 0.0]) if np.any(x >= 0.0) else np.float64(-1.0),
+    ),
+}
+# of nuPlan's score
+PARTS = (
+    "no_fault",
+    "drivable",
+    "direction",
+    "ttc_bound",
+    "speed_compliance",
+    "comfort",
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SuiteRuns:
+    """Metrics of all rows on the same C cases."""
+
+    rows: Mapping[str, CaseMetrics]  # leaves [C, ...]
+    ids: tuple[str, ...]
+    groups: tuple[str, ...]
+    preventable: np.ndarray  # [C] bool, of `simulation.rows`
+    trivial: np.ndarray  # [C] bool
+    reference: str  # the row that sets the distance
+    way: np.ndarray  # [C] m, how far it got
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -107,7 +154,7 @@ class SuiteReport:
 
 
 def rate(k: int, n: int) -> Rate:
-    """K successes of n, exact (Clopper and Pearson 1934).
+    """Returns the rate of k successes of n, exact (Clopper and Pearson 1934).
 
     Where nothing failed the bound is that of the rule of three: the exact one-sided
     bound of the failures is 1 - 0.05^(1/n) < -ln(0.05) / n < 3 / n.
@@ -117,84 +164,31 @@ def rate(k: int, n: int) -> Rate:
     return Rate(k=k, n=n, rate=k / n, low=low, high=high, bound=bound)
 
 
-def summarise(
-    runs: Mapping[str, CaseMetrics],
-    families: Sequence[str],
-    preventable: np.ndarray,
-    trivial: np.ndarray,
-    reference_name: str,
-    way: np.ndarray,
-) -> SuiteReport:
-    """The report of all rows.
-
-    Args:
-      runs: metrics [C] by row; the first is compared with the others.
-      families: [C] family of every case.
-      preventable: [C] bool, of `simulation.rows`.
-      trivial: [C] bool.
-      reference_name: the row that sets the distance.
-      way: [C] m, how far it got.
-    """
-    names = np.asarray(families)
-    scores = {
-        row: np.asarray(nuplan_score(m, jnp.asarray(way))[0]) for row, m in runs.items()
-    }
+def summarise(runs: SuiteRuns) -> SuiteReport:
+    """Reports on all rows; the first is compared with the others."""
+    names, rows = np.asarray(runs.groups), runs.rows
+    way = jnp.asarray(runs.way)
+    scores = {row: np.asarray(nuplan_score(m, way)[0]) for row, m in rows.items()}
     cluster = family_clusters(names)
-    rows = {
-        row: _row(metrics, scores[row], names, cluster, preventable, way)
-        for row, metrics in runs.items()
-    }
-    first = next(iter(runs))
-    comparisons = tuple(
-        _compare(first, other, runs, scores, cluster) for other in list(runs)[1:]
-    )
+    first, *others = rows
     return SuiteReport(
         cases=len(names),
-        families=tuple(dict.fromkeys(families)),
-        preventable=int(preventable.sum()),
-        trivial=int(trivial.sum()),
-        reference=reference_name,
-        rows=rows,
-        comparisons=comparisons,
+        families=tuple(dict.fromkeys(runs.groups)),
+        preventable=int(runs.preventable.sum()),
+        trivial=int(runs.trivial.sum()),
+        reference=runs.reference,
+        rows={
+            row: _row(metrics, scores[row], names, cluster, runs)
+            for row, metrics in rows.items()
+        },
+        comparisons=tuple(_compare(first, b, rows, scores, cluster) for b in others),
     )
 
 
-def _rates(passes: ArrayLike, columns: Sequence[str]) -> dict[str, Rate]:
-    holds = np.asarray(passes)
-    return {
-        name: rate(int(holds[:, i].sum()), holds.shape[0])
-        for i, name in enumerate(columns)
-    }
-
-
-def _sample_rates(
-    counts: ArrayLike, samples: ArrayLike, columns: Sequence[str]
-) -> dict[str, Rate]:
-    inside, total = np.asarray(counts), int(np.sum(samples))
-    return {
-        name: rate(int(inside[:, i].sum()), total) for i, name in enumerate(columns)
-    }
-
-
-def _interval(scores: np.ndarray, cluster: np.ndarray) -> tuple[float, float]:
-    """95 % bootstrap interval of the mean over clusters."""
-    if scores.size < 2:
-        return float(scores.mean()), float(scores.mean())
-    draws = ClusterBootstrap(cluster).means(scores)
-    low, high = np.quantile(draws, [0.025, 0.975])
-    return float(low), float(high)
-
-
-def _finite_low(x: np.ndarray) -> float:
-    """The 5 % quantile, in which "never" (inf) counts as large."""
-    return float(np.quantile(np.minimum(x, 1e3), 0.05))
-
-
-def _starts(seconds: np.ndarray) -> dict[str, float]:
-    """Cases with a start on a free road, and the median of theirs, s; -1 if none."""
-    found = seconds[seconds >= 0.0]
-    median = float(np.median(found)) if found.size else -1.0
-    return {"starts": float(found.size), "start_s_median": median}
+def _rates(holds: ArrayLike, total: int, columns: Sequence[str]) -> dict[str, Rate]:
+    """Returns the rate of every column of `holds` [C, columns], summed over cases."""
+    counts = np.asarray(holds).sum(axis=0).tolist()
+    return {name: rate(int(k), total) for name, k in zip(columns, counts, strict=True)}
 
 
 def _row(
@@ -202,118 +196,99 @@ def _row(
     scores: np.ndarray,
     names: np.ndarray,
     cluster: np.ndarray,
-    preventable: np.ndarray,
-    way: np.ndarray,
+    runs: SuiteRuns,
 ) -> RowSummary:
-    low, high = _interval(scores, cluster)
-    fault = np.asarray(m.at_fault) > 0
+    mean = float(scores.mean())
+    low, high = mean, mean
+    if scores.size > 1:
+        found = combine_seeds(scores, cluster)
+        low, high = found.low, found.high
+    fault, cases, samples = np.asarray(m.at_fault) > 0, len(names), int(m.samples.sum())
     jerks = COLUMNS[4:]
-    parts = ("no_fault", "drivable", "direction", "ttc_bound", "speed_compliance")
-    ratio = float(m.progress.sum() / max(float(way.sum()), 1e-9))
     return RowSummary(
-        per_case=_rates(m.holds, COLUMNS),
-        per_sample=_sample_rates(m.inside, m.samples, COLUMNS),
-        filtered_case=_rates(m.holds_filtered, jerks),
-        filtered_sample=_sample_rates(m.inside_filtered, m.samples, jerks),
+        per_case=_rates(m.holds, cases, COLUMNS),
+        per_sample=_rates(m.inside, samples, COLUMNS),
+        filtered_case=_rates(m.holds_filtered, cases, jerks),
+        filtered_sample=_rates(m.inside_filtered, samples, jerks),
         at_fault=int(fault.sum()),
-        at_fault_preventable=int((fault & preventable).sum()),
+        at_fault_preventable=int((fault & runs.preventable).sum()),
         at_fault_vru=int((np.asarray(m.at_fault_vru) > 0).sum()),
         collisions=int((np.asarray(m.collisions) > 0).sum()),
         red_lights=int(m.red_lights.sum()),
         stop_signs=int(m.stop_signs.sum()),
         off_road=int((np.asarray(m.drivable) < 1.0).sum()),
         progress_m=float(m.progress.mean()),
-        progress_ratio=ratio,
-        nuplan=float(scores.mean()),
+        progress_ratio=float(m.progress.sum() / max(float(runs.way.sum()), 1e-9)),
+        nuplan=mean,
         nuplan_low=low,
         nuplan_high=high,
-        parts={
-            **{name: float(np.mean(getattr(m, name))) for name in parts},
-            "comfort": float(np.mean(m.comfort)),
-        },
+        parts={name: float(np.mean(getattr(m, name))) for name in PARTS},
         physical={
-            "rms_a": float(np.mean(m.rms_a)),
-            "rms_j": float(np.mean(m.rms_j)),
-            "worst_a": float(np.min(m.min_a)),
-            "worst_j": float(np.max(m.max_j)),
-            "min_ttc_p5": _finite_low(np.asarray(m.min_ttc)),
-            "min_headway_p5": _finite_low(np.asarray(m.min_headway)),
-            "tet_s": float(np.mean(m.tet)),
-            "induced_over_4": float(np.mean(np.asarray(m.induced_braking) > 4.0)),
-            "brake_taps": float(np.mean(m.brake_taps)),
-            "fallback_share": float(np.mean(m.fallback_share)),
-            "standing_share": float(np.mean(m.standing_share)),
-            "creeping_share": float(np.mean(m.creeping_share)),
-            "sign_changes_per_s": float(np.mean(m.sign_changes)),
-            **_starts(np.asarray(m.start_time)),
+            name: float(how(np.asarray(getattr(m, field))))
+            for name, (field, how) in PHYSICAL.items()
         },
-        families=_by_family(m, scores, names, preventable, way),
+        families={
+            name: _family(m, scores, names == name, fault, runs)
+            for name in dict.fromkeys(names.tolist())
+        },
     )
 
 
-def _by_family(
+def _family(
     m: CaseMetrics,
     scores: np.ndarray,
-    names: np.ndarray,
-    preventable: np.ndarray,
-    way: np.ndarray,
-) -> dict[str, dict[str, float]]:
-    found = {}
-    for name in dict.fromkeys(names.tolist()):
-        at = names == name
-        fault = np.asarray(m.at_fault)[at] > 0
-        samples = max(int(m.samples[at].sum()), 1)
-        shares = m.inside[at].sum(axis=0) / samples
-        passes = m.holds[at].mean(axis=0)
-        reached = float(way[at].sum())
-        found[name] = {
-            "cases": float(at.sum()),
-            "at_fault": float(fault.sum()),
-            "at_fault_preventable": float((fault & preventable[at]).sum()),
-            "progress_ratio": float(m.progress[at].sum() / max(reached, 1e-9)),
-            "nuplan": float(scores[at].mean()),
-            **{f"{c}_sample": float(x) for c, x in zip(COLUMNS, shares, strict=True)},
-            **{f"{c}_case": float(x) for c, x in zip(COLUMNS, passes, strict=True)},
-        }
-    return found
+    at: np.ndarray,
+    fault: np.ndarray,
+    runs: SuiteRuns,
+) -> dict[str, float]:
+    """Returns the numbers of the cases `at` [C] of a family."""
+    samples = max(int(m.samples[at].sum()), 1)
+    shares = m.inside[at].sum(axis=0) / samples
+    passes = m.holds[at].mean(axis=0)
+    reached = float(runs.way[at].sum())
+    return {
+        "cases": float(at.sum()),
+        "at_fault": float(fault[at].sum()),
+        "at_fault_preventable": float((fault & runs.preventable)[at].sum()),
+        "progress_ratio": float(m.progress[at].sum() / max(reached, 1e-9)),
+        "nuplan": float(scores[at].mean()),
+        **{f"{c}_sample": float(x) for c, x in zip(COLUMNS, shares, strict=True)},
+        **{f"{c}_case": float(x) for c, x in zip(COLUMNS, passes, strict=True)},
+    }
 
 
 def _compare(
     a: str,
     b: str,
-    runs: Mapping[str, CaseMetrics],
+    rows: Mapping[str, CaseMetrics],
     scores: Mapping[str, np.ndarray],
     cluster: np.ndarray,
 ) -> SuiteComparison:
-    """McNemar per column with Holm over the columns; differences over families."""
-    mine, theirs = runs[a].holds, runs[b].holds
-    wins = (mine & ~theirs).sum(axis=0)
-    losses = (~mine & theirs).sum(axis=0)
-    raw = [mcnemar_exact(int(w), int(x)) for w, x in zip(wins, losses, strict=True)]
-    adjusted = holm(np.array(raw))
+    """Makes McNemar per column with Holm over them, and differences over families."""
+    mine, theirs = rows[a].holds, rows[b].holds
+    wins = (mine & ~theirs).sum(axis=0).tolist()
+    losses = (~mine & theirs).sum(axis=0).tolist()
+    raw = [mcnemar_exact(w, x) for w, x in zip(wins, losses, strict=True)]
+    columns = zip(wins, losses, raw, holm(raw).tolist(), strict=True)
+
+    def apart(x: ArrayLike, y: ArrayLike) -> Difference:
+        """Returns the mean of x - y [C] over clusters; of one case alone."""
+        x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+        if x.size < 2:
+            mean = float(x[0] - y[0])
+            return Difference(mean=mean, low=-np.inf, high=np.inf, se=np.inf, p=1.0)
+        return cluster_t(x, y, cluster)
+
     return SuiteComparison(
         a=a,
         b=b,
-        columns={
-            name: (int(wins[i]), int(losses[i]), raw[i], float(adjusted[i]))
-            for i, name in enumerate(COLUMNS)
-        },
+        columns=dict(zip(COLUMNS, columns, strict=True)),
         over_families={
-            name: _apart(mine[:, i], theirs[:, i], cluster)
-            for i, name in enumerate(COLUMNS)
+            name: apart(mine[:, i], theirs[:, i]) for i, name in enumerate(COLUMNS)
         },
-        progress_m=_apart(runs[a].progress, runs[b].progress, cluster),
-        nuplan=_apart(scores[a], scores[b], cluster),
+        progress_m=apart(rows[a].progress, rows[b].progress),
+        nuplan=apart(scores[a], scores[b]),
     )
-
-
-def _apart(a: ArrayLike, b: ArrayLike, cluster: np.ndarray) -> Difference:
-    """Mean of a - b [C] over clusters; of one case alone."""
-    x, y = np.asarray(a, np.float64), np.asarray(b, np.float64)
-    if x.size < 2:
-        mean = float(x[0] - y[0])
-        return Difference(mean=mean, low=-np.inf, high=np.inf, se=np.inf, p=1.0)
-    return cluster_t(x, y, cluster)
 
 
 # ---------------------------------------------------------------- text
@@ -329,7 +304,7 @@ SHORT = {
 
 
 def _rate_cell(found: Rate) -> str:
-    """98.76 [98.1, 99.2], or 100 [>= 99.91] with the rule of three."""
+    """Formats 98.76 [98.1, 99.2], or 100 [>= 99.91] with the rule of three."""
     if found.bound is not None:
         return f"100 (>={100 * found.bound:.2f})"
     low, high = 100 * found.low, 100 * found.high
@@ -337,7 +312,7 @@ def _rate_cell(found: Rate) -> str:
 
 
 def text_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table whose columns are as wide as they need; numbers to the right."""
+    """Formats a table as lines; columns as wide as they need, numbers to the right."""
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
     lines = []
     for row in [header, *rows]:
@@ -348,7 +323,7 @@ def text_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str
 
 
 def format_suite(report: SuiteReport) -> str:
-    """The paper's table per case and per sample, safety and progress, differences."""
+    """Formats the paper's table, safety and progress, and the differences."""
     lines = [
         f"{report.cases:,} cases of {len(report.families)} groups; "
         f"{report.preventable:,} preventable by a careful driver, "
@@ -383,30 +358,21 @@ def format_suite(report: SuiteReport) -> str:
 
 
 def _safety(name: str, row: RowSummary) -> list[str]:
+    starts, median = (row.physical[key] for key in ("starts", "start_s_median"))
+    counts = ("at_fault", "at_fault_preventable", "at_fault_vru", "collisions")
+    counts += ("red_lights", "stop_signs", "off_road")
+    low, high = 100 * row.nuplan_low, 100 * row.nuplan_high
     return [
         name,
         f"{100 * row.filtered_case['j_station'].rate:.1f}",
         f"{100 * row.filtered_sample['j_station'].rate:.2f}",
-        str(row.at_fault),
-        str(row.at_fault_preventable),
-        str(row.at_fault_vru),
-        str(row.collisions),
-        str(row.red_lights),
-        str(row.stop_signs),
-        str(row.off_road),
+        *(str(getattr(row, key)) for key in counts),
         f"{100 * row.physical['creeping_share']:.1f} %",
-        _start(row),
+        f"{median:.1f} ({starts:.0f})" if starts else "- (0)",
         f"{row.physical['sign_changes_per_s']:.2f}",
         f"{100 * row.progress_ratio:.1f} %",
-        f"{100 * row.nuplan:.1f} [{100 * row.nuplan_low:.1f},"
-        f"{100 * row.nuplan_high:.1f}]",
+        f"{100 * row.nuplan:.1f} [{low:.1f},{high:.1f}]",
     ]
-
-
-def _start(row: RowSummary) -> str:
-    """5.4 (120), or - (0) where no case has a start on a free road."""
-    count, median = (row.physical[key] for key in ("starts", "start_s_median"))
-    return f"{median:.1f} ({count:.0f})" if count else "- (0)"
 
 
 def _differences(report: SuiteReport) -> list[str]:
@@ -435,7 +401,7 @@ def _differences(report: SuiteReport) -> list[str]:
 
 
 def format_families(report: SuiteReport, row: str) -> str:
-    """The per-family table of one row."""
+    """Formats the per-family table of one row."""
     header = ["family", "cases", "faults", "prevent.", *(SHORT[c] for c in COLUMNS[1:])]
     header += ["progress", "nuPlan"]
     rows = []
@@ -451,42 +417,29 @@ def format_families(report: SuiteReport, row: str) -> str:
 
 
 def write_csv(
-    path: Path,
-    runs: Mapping[str, CaseMetrics],
-    ids: Sequence[str],
-    preventable: np.ndarray,
-    parameters: Sequence[Mapping[str, float]],
+    path: Path, runs: SuiteRuns, parameters: Sequence[Mapping[str, float]]
 ) -> None:
-    """One line per row and case: id, every metric, the case's parameters."""
-    fields = dataclasses.fields(CaseMetrics)
+    """Writes one line per row and case: id, every metric, the case's parameters."""
     names = []
-    for field in fields:
-        value = np.asarray(getattr(next(iter(runs.values())), field.name))
-        names += _column_names(field.name, value)
+    for name, value in vars(next(iter(runs.rows.values()))).items():
+        width = np.asarray(value).reshape(len(runs.ids), -1).shape[1]
+        labels = COLUMNS if width == len(COLUMNS) else COLUMNS[4:]
+        names += [f"{name}.{label}" for label in labels] if width > 1 else [name]
     keys = sorted({key for found in parameters for key in found})
     text = io.StringIO(newline="")
     writer = csv.writer(text)
     writer.writerow(["row", "case", "preventable", *names, *keys])
-    for row, metrics in runs.items():
-        columns = [np.asarray(getattr(metrics, f.name)) for f in fields]
-        for i, case in enumerate(ids):
-            cells = [x for column in columns for x in np.atleast_1d(column[i])]
+    for row, metrics in runs.rows.items():
+        columns = [np.asarray(value) for value in vars(metrics).values()]
+        for i, case in enumerate(runs.ids):
+            cells = [x for column in columns for x in np.atleast_1d(column[i]).tolist()]
             drawn = [parameters[i].get(key, "") for key in keys]
-            flag = int(preventable[i])
-            plain = [x.item() if hasattr(x, "item") else x for x in cells]
-            writer.writerow([row, case, flag, *plain, *drawn])
+            writer.writerow([row, case, int(runs.preventable[i]), *cells, *drawn])
     write_whole(path, text.getvalue())
 
 
-def _column_names(name: str, value: np.ndarray) -> list[str]:
-    if value.ndim == 1:
-        return [name]
-    labels = COLUMNS if value.shape[1] == len(COLUMNS) else COLUMNS[4:]
-    return [f"{name}.{label}" for label in labels]
-
-
 def result_hash(metrics: CaseMetrics) -> str:
-    """sha256 over all metrics of all cases in order.
+    """Returns the sha256 over all metrics of all cases in order.
 
     Equal for two runs and for two batch sizes, or something is not
     reproducible.

@@ -38,9 +38,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop.runs import SuiteRuns
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, SuiteResult
-from rcirl_jax.evaluation.closed_loop.summary import result_hash
+from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns, result_hash
 from rcirl_jax.evaluation.gate.types import (
     CANDIDATE,
     INCUMBENT,
@@ -134,7 +133,7 @@ def repeats(row: Row, result: SuiteResult, config: SuiteConfig) -> None:
     cases, count = result.cases, min(LANES, len(result.cases.ids))
     rollout = rollout_config(row, cases.duration_s, config.plan_every)
     again = drive_row(row, cases.build, count, rollout, chunk=LANES)
-    before = jax.tree.map(lambda x: x[:count], result.runs[row.name])
+    before = jax.tree.map(lambda x: x[:count], result.rows[row.name])
     if result_hash(again) != result_hash(before):
         raise InputError(
             f"gate: {row.name}: the first {count} cases, driven twice, differ:"
