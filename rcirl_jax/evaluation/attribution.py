@@ -13,44 +13,10 @@ Source: Sundararajan, Taly and Yan, Axiomatic Attribution for Deep Networks
 import jax
 import jax.numpy as jnp
 
-from rcirl_jax.errors import InputError
 from rcirl_jax.reward import Normaliser, RewardParams, effective_model, normalise
-from rcirl_jax.reward.network import ACTIVATIONS, layers_of, scene_values
+from rcirl_jax.reward.network import scene_values
 
 STEPS = 64  # points on the line from b to a
-
-
-def _check(
-    params: RewardParams,
-    normaliser: Normaliser,
-    features: jax.Array,
-    time_valid: jax.Array,
-    activation: str,
-) -> None:
-    """Refuse features [T, F] that do not fit the network; reads shapes only."""
-    if activation not in ACTIVATIONS:
-        raise InputError(
-            f"attribute: activation: {activation}: expected one of"
-            f" {sorted(ACTIVATIONS)}"
-        )
-    expected = (
-        params["gamma"].shape[0],
-        layers_of(params["point"])[0][0].shape[0],
-    )
-    if features.shape != expected:
-        raise InputError(
-            f"attribute: features: shape {features.shape}: expected T, F = {expected}"
-        )
-    if normaliser.scale.shape != expected[1:]:
-        raise InputError(
-            f"attribute: normaliser: shape {normaliser.scale.shape}: expected"
-            f" [{expected[1]}]"
-        )
-    if time_valid.shape != expected[:1]:
-        raise InputError(
-            f"attribute: time_valid: shape {time_valid.shape}: expected"
-            f" {expected[:1]}, one flag per time"
-        )
 
 
 def attribute(
@@ -62,7 +28,7 @@ def attribute(
     activation: str,
     steps: int = STEPS,
 ) -> jax.Array:
-    """Contribution of each feature at each time to V(a) - V(b).
+    """Returns the contribution of each feature at each time to V(a) - V(b).
 
         C_ti = gamma_t (x^a_ti - x^b_ti)
                * integral over u in [0, 1] of dR/dx_i (x^b_t + u (x^a_t - x^b_t))
@@ -84,20 +50,7 @@ def attribute(
 
     Returns:
       [T, F], no unit; 0 at times that are not valid, whatever the features.
-
-    Raises:
-      InputError: a shape that does not fit, an unknown activation, no steps.
     """
-    features_a, features_b = jnp.asarray(features_a), jnp.asarray(features_b)
-    time_valid = jnp.asarray(time_valid)
-    if features_a.shape != features_b.shape or features_a.ndim != 2:
-        raise InputError(
-            f"attribute: features: shapes {features_a.shape}, {features_b.shape}:"
-            " expected [T, F] for both"
-        )
-    _check(params, normaliser, features_a, time_valid, activation)
-    if steps < 1:
-        raise InputError(f"attribute: steps: {steps}: expected at least 1")
     start = normalise(normaliser, features_b)
     clipped_a, clipped_b = (
         jnp.clip(features, normaliser.lower, normaliser.upper)

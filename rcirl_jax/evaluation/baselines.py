@@ -74,28 +74,26 @@ Proposals = Generator[np.ndarray, np.ndarray, None]
 # ---------------------------------------------------------------- searches
 
 
-def population(size: int) -> int:
-    """Returns the vectors of a generation, as Hansen's tutorial has it."""
-    return 4 + int(3.0 * math.log(size))
-
-
 def _by_cma_es(start: np.ndarray, _: float, sigma: float, seed: int) -> Proposals:
     import cma  # a second, which only tuning takes
 
     normal = np.random.Generator(np.random.Philox(seed)).standard_normal
     # quiet: no files, no output, no signals file; the only random numbers are ours
-    options: dict[str, Any] = {"verbose": -10, "verb_log": 0, "verb_disp": 0}
-    options["seed"] = math.nan
-    options |= {
-        "randn": lambda *shape: normal(shape),
-        "popsize": population(start.size),
-    }
+    options: dict[str, Any] = {
+        "verbose": -10, "verb_log": 0, "verb_disp": 0, "seed": math.nan,
+        "randn": lambda *shape: normal(shape), "popsize": _generation(start.size),
+    }  # fmt: skip
     while True:
         search = cma.CMAEvolutionStrategy(start, sigma, options)
         while not search.stop():
             asked = search.ask()
             search.tell(asked, (yield np.asarray(asked)).tolist())
         options["popsize"] *= 2  # converged: again, and broader
+
+
+def _generation(size: int) -> int:
+    """Returns the number of vectors of a generation, as Hansen's tutorial has it."""
+    return 4 + int(3.0 * math.log(size))
 
 
 def new_study(seed: int, direction: str = "minimize") -> "optuna.Study":
@@ -115,20 +113,17 @@ def _by_tpe(start: np.ndarray, at_start: float, sigma: float, seed: int) -> Prop
     import optuna
 
     first = {f"x{i}": at for i, at in enumerate(start.tolist())}
+    reach, of = REACH * sigma, optuna.distributions.FloatDistribution
     space: dict[str, optuna.distributions.BaseDistribution] = {
-        name: optuna.distributions.FloatDistribution(
-            at - REACH * sigma, at + REACH * sigma
-        )
-        for name, at in first.items()
+        name: of(at - reach, at + reach) for name, at in first.items()
     }
     study.add_trial(
         optuna.trial.create_trial(params=first, distributions=space, value=at_start)
     )
     while True:
-        trials = [study.ask(space) for _ in range(population(start.size))]
-        values = yield np.array(
-            [[one.params[name] for name in first] for one in trials]
-        )
+        trials = [study.ask(space) for _ in range(_generation(start.size))]
+        asked = [[one.params[name] for name in first] for one in trials]
+        values = yield np.array(asked)
         for trial, value in zip(trials, values.tolist(), strict=True):
             study.tell(trial, value)
 
@@ -180,7 +175,7 @@ def tune(
                 break
             values = np.where(finite, found, found[finite].max(initial=0.0) + 1.0)
             if proposals is None:
-                begin = (asked[0], float(values[0]), sigma, seed)
+                begin = asked[0], float(values[0]), sigma, seed
                 proposals = SEARCHES[search](*begin)
                 asked = next(proposals)[:left]
             else:

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.attribution import attribute
 from rcirl_jax.reward import Normaliser, effective_model, normalise, value
 from rcirl_jax.reward.network import point_of
@@ -120,22 +119,3 @@ def test_invalid_times_contribute_nothing_whatever_is_there():
     np.testing.assert_array_equal(got[~VALID], 0.0)
     assert np.all(np.isfinite(got))
     assert float(got.sum()) == pytest.approx(difference(params, a, b), rel=1e-3)
-
-
-def test_input_that_does_not_fit_is_refused():
-    params, norm = network(), normaliser()
-    a, b = trajectories()
-    fewer = r"features: shape .*T, F = \(18, 21\)"
-    cases = (
-        (r"features: shapes .*expected \[T, F\]", a, b[:-1], VALID, "tanh", 64),
-        (fewer, a[:, 1:], b[:, 1:], VALID, "tanh", 64),
-        ("time_valid: shape", a, b, VALID[1:], "tanh", 64),
-        ("activation: sine: expected one of", a, b, VALID, "sine", 64),
-        ("steps: 0: expected at least 1", a, b, VALID, "tanh", 0),
-    )
-    for message, x, y, valid, name, steps in cases:
-        with pytest.raises(InputError, match="^attribute: " + message):
-            attribute(params, norm, x, y, valid, name, steps)
-    short = jax.tree.map(lambda leaf: leaf[1:], norm)
-    with pytest.raises(InputError, match="normaliser: shape"):
-        attribute(params, short, a, b, VALID, "tanh")
