@@ -12,6 +12,7 @@ alone, and shows where it gets to by itself.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -33,7 +34,7 @@ from rcirl_jax.simulation.suite import suite_refs
 from rcirl_jax.tuning.prior_cost import fit_prior_cost
 from rcirl_jax.tuning.recipes import SimulatedDemonstrations
 from rcirl_jax.tuning.run import Run
-from rcirl_jax.tuning.stages import train_round
+from rcirl_jax.tuning.stages import train_one
 
 
 def source(run: Run, given: str | Logs, number: int) -> Dataset:
@@ -96,7 +97,8 @@ def with_simulated(
         if number:
             learner = run.folder / "rounds" / f"{number}.msgpack"
             prior = fit_prior_cost(run, sources, recorded, drives)
-            train_round(run, joined, number, learner, prior)
+            stage = f"demonstrate learner {number}"
+            train_one(run, stage, joined, 0, learner, prior)
         drives.append(_round(run, number, learner))
         if plan.weights[number] > 0.0:
             made.append(drives[-1])
@@ -107,7 +109,7 @@ def with_simulated(
 
 
 def _round(run: Run, number: int, learner: Path | None) -> Dataset:
-    """The drives of a round; the expert's alone without a learner."""
+    """Drives a round; the expert's alone without a learner."""
     plan, incumbent = run.config.simulated, run.config.incumbent
     inputs = {
         "simulated_demonstrations": dataclasses.asdict(plan),
@@ -117,22 +119,20 @@ def _round(run: Run, number: int, learner: Path | None) -> Dataset:
     }
     key = digest({**inputs, **run.code()})[:8]
     folder = run.folder / f"demonstrations-{key}" / str(number)
-
-    def work() -> None:
-        drive_round(
-            number,
-            plan,
-            folder,
-            incumbent=incumbent,
-            learner=learner,
-            before_commit=run.sign,
-        )
-
+    work = functools.partial(
+        drive_round,
+        number,
+        plan,
+        folder,
+        incumbent=incumbent,
+        learner=learner,
+        before_commit=run.sign,
+    )
     return _made(run, f"demonstrate {number}", inputs, folder, work)
 
 
 def _made(
-    run: Run, stage: str, inputs: dict, folder: Path, work: Callable[[], None]
+    run: Run, stage: str, inputs: dict, folder: Path, work: Callable[[], object]
 ) -> Dataset:
     """Makes a dataset as a stage."""
     manifest = folder / "manifest.json"

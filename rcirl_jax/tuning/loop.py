@@ -8,11 +8,10 @@ times how much longer this machine took for the stages that it has done. Compili
 which does not grow with the work, counts in neither.
 """
 
-import contextlib
-import functools
+import dataclasses
 import textwrap
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from rcirl_jax.data.importing import Logs
 from rcirl_jax.data.store.dataset import Dataset, Demonstrations, shares_of
@@ -61,7 +60,7 @@ NO_REPORT = "no report: "  # begins the line on what it needs
 
 
 def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
-    """Run the stages in order and print their results.
+    """Runs the stages in order and prints their results.
 
     Args:
       run: folder and settings.
@@ -72,46 +71,52 @@ def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
     job, _ = suite_job(run, tuned=False)
     shares = shares_of(run.config.data_weights, len(given))
     _check_incumbent(run)
-    sources: list[Dataset] = []
-    everything: list[Demonstrations] = []  # what was imported; and that with simulated
-    verdict = functools.cache(lambda: verdict_of(run))  # once, where it is asked for
-    page: list[str] = []
-
-    def imported() -> None:
-        sources.extend(source(run, one, number) for number, one in enumerate(given))
-        everything.append(as_one(sources, shares))
-
-    def trained() -> None:
-        train_seeds(run, everything[-1])
-        run.say(_said_of_weights(run))
-
-    steps: dict[str, Callable[[], object]] = {
-        "import": imported,
-        "demonstrate": lambda: everything.append(with_simulated(run, sources, shares)),
-        "train": trained,
-        "rank": lambda: rank(run, everything[0]),
-        "simulate": lambda: simulate(run, sources),
-        "gate": lambda: gate(run, verdict),
-        "report": lambda: page.append(_drawn(run, verdict, everything[0], sources)),
-    }
-    names = STAGES[: STAGES.index(last) + 1]
+    names, made = STAGES[: STAGES.index(last) + 1], Made()
     with compiles() as compiled:
-        watch = Clock(run, names, compiled)
-        for name in names:
-            known = everything[0] if everything else None
-            with watch.stage(name, work_of(run, job, known)):
-                steps[name]()
-    if last in ("gate", "report"):
-        run.say(_ending(run, verdict(), page, job.refs[0].id))
-    elif last not in ("import", "demonstrate"):
+        clock = Clock(run, names, compiled)
+        for name in _stages(run, given, shares, made):
+            if name not in names:
+                break
+            clock.begin(name, work_of(run, job, made.recorded))
+    if made.verdict is not None:
+        run.say(_ending(run, made.verdict, made.page, job.refs[0].id))
+    elif "train" in names:
         run.say(f"weights: {run.weights}")
 
 
+@dataclasses.dataclass
+class Made:
+    """What the stages have made so far."""
+
+    recorded: Demonstrations | None = None  # what was imported
+    verdict: Verdict | None = None
+    page: str = ""  # a line on the report, if it was asked for
+
+
+def _stages(
+    run: Run, given: Sequence[str | Logs], shares: Sequence[float] | None, made: Made
+) -> Iterator[str]:
+    """Does the stages in order; yields the name of each before it begins."""
+    yield "import"
+    sources = [source(run, one, number) for number, one in enumerate(given)]
+    made.recorded = recorded = as_one(sources, shares)
+    yield "demonstrate"
+    everything = with_simulated(run, sources, shares)
+    yield "train"
+    train_seeds(run, everything)
+    run.say(_said_of_weights(run))
+    yield "rank"
+    rank(run, recorded)
+    yield "simulate"
+    simulate(run, sources)
+    yield "gate"
+    made.verdict = gate(run)
+    yield "report"
+    made.page = _drawn(run, made.verdict, recorded, sources)
+
+
 def _drawn(
-    run: Run,
-    verdict: Callable[[], Verdict],
-    dataset: Demonstrations,
-    sources: Sequence[Dataset],
+    run: Run, verdict: Verdict, dataset: Demonstrations, sources: Sequence[Dataset]
 ) -> str:
     """Draws the page; returns where it is, or the extra that it needs."""
     try:
@@ -123,8 +128,8 @@ def _drawn(
     return f"report to open: {run.page}"
 
 
-def _ending(run: Run, verdict: Verdict, page: Sequence[str], first: str) -> str:
-    """The last lines: verdict, reason, files, next command; about eight.
+def _ending(run: Run, verdict: Verdict, page: str, first: str) -> str:
+    """Returns the last lines: verdict, reason, files, next command; about eight.
 
     Args:
       run: whose verdict it is.
@@ -134,17 +139,18 @@ def _ending(run: Run, verdict: Verdict, page: Sequence[str], first: str) -> str:
     """
     lines = ["", f"verdict: {verdict.decision.upper()}"]
     lines += textwrap.wrap(verdict.sentence, WIDTH)
-    lines += [f"weights: {run.weights}", f"all tables: {run.tables}", *page]
+    lines += [f"weights: {run.weights}", f"all tables: {run.tables}"]
+    lines += [page] if page else []
     case = (*verdict.look_at, first)[0]
     step = f"rcirl replay --weights={run.weights} --case={case}"
     step += f" --output={run.folder / 'case'}"
-    if any(line.startswith(NO_REPORT) for line in page):
+    if page.startswith(NO_REPORT):
         step = f"install it, then rcirl report --run={run.folder}"
     return "\n".join([*lines, f"next: {step}"])
 
 
 def draw_again(run: Run, given: Sequence[str | Logs]) -> None:
-    """The stage report alone, of a run that has its verdict.
+    """Draws the report alone, of a run that has its verdict.
 
     Args:
       run: folder and settings.
@@ -153,12 +159,12 @@ def draw_again(run: Run, given: Sequence[str | Logs]) -> None:
     shares = shares_of(run.config.data_weights, len(given))
     sources = [kept_source(run, one, number) for number, one in enumerate(given)]
     dataset = as_one(sources, shares)
-    report(run, functools.cache(lambda: verdict_of(run)), dataset, sources)
+    report(run, verdict_of(run), dataset, sources)
     run.say(f"report to open: {run.page}")
 
 
 def _check_incumbent(run: Run) -> None:
-    """An incumbent of other features or sampler could not be ranked beside."""
+    """Refuses an incumbent of other features or sampler: it could not be ranked."""
     known = run.incumbent_reward()
     if known is None:
         return
@@ -171,7 +177,7 @@ def _check_incumbent(run: Run) -> None:
 
 
 def _said_of_weights(run: Run) -> str:
-    """Features that the training never saw vary; gains of a prior cost; one a line."""
+    """Says which features never vary in training, and a prior cost's gains."""
     reward = open_reward(str(run.weights))
     silent = "features without effect, for they never vary in the training data: "
     silent += ", ".join(reward.unsupported) or "none"
@@ -182,7 +188,7 @@ def _said_of_weights(run: Run) -> str:
 def work_of(
     run: Run, job: SuiteJob, dataset: Demonstrations | None
 ) -> dict[str, float] | None:
-    """Seconds on two usual cores of each stage but import; None before the import.
+    """Returns seconds on two usual cores of each stage but import; None before it.
 
     Args:
       run: its settings.
@@ -209,7 +215,7 @@ def work_of(
 
 
 class Clock:
-    """Announces each stage.
+    """Announces each stage, and learns from how long they took.
 
     Args:
       run: whose stages they are.
@@ -221,53 +227,42 @@ class Clock:
         self, run: Run, names: Sequence[str], compiled: Sequence[float]
     ) -> None:
         self._run, self._names, self._compiled = run, names, compiled
-        self._begin = time.monotonic()
+        self._start = self._begin = time.monotonic()
         self._worked, self._took = 0.0, 0.0  # s, of usual cores and of this machine
         self._known = {*run.stages.read()}  # stages of an earlier run
+        # of the stage that is at work: s expected, s compiled before, stages done
+        self._expected, self._before, self._done = 0.0, 0.0, 0
 
-    @contextlib.contextmanager
-    def stage(self, name: str, work: Mapping[str, float] | None) -> Iterator[None]:
-        """Say that a stage begins, do it, and learn from how long it took.
+    def begin(self, name: str, work: Mapping[str, float] | None) -> None:
+        """Says that a stage begins, so that the one before it has ended.
 
         Args:
           name: of the stage.
           work: of every stage (`work_of`).
         """
-        self._run.say(self.line(name, work))
-        begin, compiled = time.monotonic(), sum(self._compiled)
-        done = len(self._run.done)
-        yield
-        expected = (work or {}).get(name, 0.0)
-        if len(self._run.done) > done and expected:
-            took = time.monotonic() - begin - (sum(self._compiled) - compiled)
-            self._worked += expected
+        now, compiled, done = time.monotonic(), sum(self._compiled), len(self._run.done)
+        if self._expected and done > self._done:
+            took = now - self._begin - (compiled - self._before)
+            self._worked += self._expected
             self._took += max(took, 0.0)
-
-    def line(self, name: str, work: Mapping[str, float] | None) -> str:
-        """The line printed when a stage begins."""
-        number, count = self._names.index(name) + 1, len(self._names)
-        so_far = f"{in_words(time.monotonic() - self._begin)} so far"
-        text = f"stage {number} of {count}: {name}; {so_far}"
-        if work is None:
-            return text
-        left = sum(work.get(one, 0.0) for one in self._to_do(self._names[number - 1 :]))
-        left *= (self._took + USUAL_S) / (self._worked + USUAL_S)
-        return f"{text}, about {in_words(left)} left, compiling not counted"
-
-    def _to_do(self, names: Sequence[str]) -> list[str]:
-        """Stages that will not be kept, as far as can be known.
-
-        While nothing has changed, what an earlier run has finished will be kept.
-        """
-        if self._run.done:
-            return [*names]
-        last = f"demonstrate {self._run.config.simulated.datasets - 1}"
-        ends = {"demonstrate": last, **LAST}
-        return [name for name in names if ends.get(name) not in self._known]
+        self._begin, self._before, self._done = now, compiled, done
+        self._expected = (work or {}).get(name, 0.0)
+        number = self._names.index(name)
+        text = f"stage {number + 1} of {len(self._names)}: {name}; "
+        text += f"{in_words(now - self._start)} so far"
+        if work is not None:
+            # what an earlier run has finished will be kept, unless something changed
+            last = f"demonstrate {self._run.config.simulated.datasets - 1}"
+            ends = {} if done else {"demonstrate": last, **LAST}
+            to_do = [n for n in self._names[number:] if ends.get(n) not in self._known]
+            left = sum(work.get(one, 0.0) for one in to_do)
+            left *= (self._took + USUAL_S) / (self._worked + USUAL_S)
+            text += f", about {in_words(left)} left, compiling not counted"
+        self._run.say(text)
 
 
 def in_words(seconds: float) -> str:
-    """A duration: "40 s", "12 min", "1 h 05 min"."""
+    """Formats a duration: "40 s", "12 min", "1 h 05 min"."""
     if seconds < 59.5:
         return f"{seconds:.0f} s"
     hours, minutes = divmod(round(seconds / 60.0), 60)

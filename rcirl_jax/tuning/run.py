@@ -70,6 +70,11 @@ class Run:
         return self.folder / "weights.msgpack"
 
     @property
+    def metrics(self) -> Path:
+        """The driven suite."""
+        return self.folder / "suite" / "metrics.npz"
+
+    @property
     def tables(self) -> Path:
         """The verdict's checks and the held-out drives as text."""
         return self.folder / "verdict.txt"

@@ -5,8 +5,7 @@ the closed loop's cases and the margins are those of `evaluation`.
 """
 
 import dataclasses
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rcirl_jax.data.store.dataset import Dataset, Demonstrations
@@ -18,7 +17,6 @@ from rcirl_jax.evaluation.closed_loop.likeness import (
 )
 from rcirl_jax.evaluation.closed_loop.runs import read_runs, write_runs
 from rcirl_jax.evaluation.closed_loop.suite import write_suite
-from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns
 from rcirl_jax.evaluation.gate.types import CANDIDATE, INCUMBENT, Verdict
 from rcirl_jax.evaluation.gate.verdict import judge, pair_of, write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
@@ -58,21 +56,6 @@ RECORDED = 2  # held-out drives to play, of all sources
 # Training
 
 
-def train_round(
-    run: Run, dataset: Demonstrations, number: int, file: Path, prior: Path | None
-) -> None:
-    """Trains the learner of a round of simulated demonstrations.
-
-    Args:
-      run: folder and settings.
-      dataset: what there is to learn from by now.
-      number: of the round.
-      file: weights to write.
-      prior: of its prior cost, if it has one.
-    """
-    _train(run, f"demonstrate learner {number}", dataset, 0, file, prior)
-
-
 def train_seeds(run: Run, dataset: Demonstrations) -> None:
     """Trains every seed, exports it; the median one becomes the candidate.
 
@@ -81,7 +64,7 @@ def train_seeds(run: Run, dataset: Demonstrations) -> None:
     files = run.seed_files
     prior = prior_cost_file(run, run.config.simulated.datasets)
     for number, file in enumerate(files):
-        _train(run, f"train {number}", dataset, number, file, prior)
+        train_one(run, f"train {number}", dataset, number, file, prior)
     steps = -(-dataset.indices("train").size // run.config.train.batch_size)
 
     def won(number: int) -> float:
@@ -96,7 +79,7 @@ def train_seeds(run: Run, dataset: Demonstrations) -> None:
     run.stage("export", {"seeds": hashes}, [run.weights], choose)
 
 
-def _train(
+def train_one(
     run: Run,
     stage: str,
     dataset: Demonstrations,
@@ -104,7 +87,16 @@ def _train(
     file: Path,
     prior: Path | None,
 ) -> None:
-    """Does one training as a stage, exported to a weights file."""
+    """Does one training as a stage, exported to a weights file.
+
+    Args:
+      run: folder and settings.
+      stage: its name.
+      dataset: what there is to learn from.
+      seed: of the training.
+      file: weights to write.
+      prior: of its prior cost, if it has one.
+    """
     inputs = {**_decides_training(run, dataset), "seed": seed}
     if prior:
         inputs["prior_cost"] = file_sha256(prior)
@@ -121,23 +113,18 @@ def _train(
 
 
 def _decides_training(run: Run, dataset: Demonstrations) -> dict:
-    """The settings and data that decide a training, but its seed and prior cost."""
+    """Returns what decides a training, but its seed and prior cost."""
     settings = dataclasses.asdict(run.config.train)
     return {"config": settings, "dataset": dataset.hash, **run.code()}
 
 
 def _workdir(run: Run, dataset: Demonstrations, seed: int) -> Path:
-    """The folder of a training run."""
-    key = digest(_decides_training(run, dataset))[:8]
-    return run.folder / f"train-{key}" / f"seed-{seed}"
+    """Returns the folder of a training run."""
+    return _folder_of(run, _decides_training(run, dataset), seed)
 
 
-def _kept_workdir(run: Run, seed: int) -> Path:
-    """The folder of a finished training run, from the notes of its stage."""
-    noted = run.stages.read().get(f"train {seed}", {}).get("inputs", {})
-    decided = ("config", "dataset", *run.code())
-    key = digest({name: noted.get(name) for name in decided})[:8]
-    return run.folder / f"train-{key}" / f"seed-{seed}"
+def _folder_of(run: Run, decided: Mapping[str, object], seed: int) -> Path:
+    return run.folder / f"train-{digest(decided)[:8]}" / f"seed-{seed}"
 
 
 # Ranking of held-out scenes
@@ -262,28 +249,25 @@ def simulate(run: Run, sources: Sequence[Dataset]) -> None:
     run.stage("likeness", inputs, [arrays, body, text], compare)
 
 
-def _suite_runs(run: Run) -> SuiteRuns:
-    """The driven suite of the finished simulation."""
-    return read_runs(run.folder / "suite" / "metrics.npz")
-
-
 # Verdict and report
 
 
 def verdict_of(run: Run) -> Verdict:
-    """The gate's verdict on the finished simulation and held-out drives."""
+    """Judges the finished simulation and held-out drives."""
     job, incumbent = suite_job(run)
-    known, gate = read_arrays(run.folder / "likeness.npz"), run.config.gate
-    pair = pair_of(_suite_runs(run), incumbent, gate.trivial_baselines, known)
+    runs, known = read_runs(run.metrics), read_arrays(run.folder / "likeness.npz")
+    gate = run.config.gate
+    pair = pair_of(runs, incumbent, gate.trivial_baselines, known)
     return judge(pair, gate, left_out(job))
 
 
-def gate(run: Run, verdict: Callable[[], Verdict]) -> None:
-    """Writes the verdict, computing it if there is none yet."""
+def gate(run: Run) -> Verdict:
+    """Judges; writes the verdict, if there is none yet."""
     path = run.folder / "verdict.json"
     job, incumbent = suite_job(run)
+    verdict = verdict_of(run)
     inputs = {
-        "metrics": file_sha256(run.folder / "suite" / "metrics.npz"),
+        "metrics": file_sha256(run.metrics),
         "likeness": file_sha256(run.folder / "likeness.npz"),
         "gate": dataclasses.asdict(run.config.gate),
         "incumbent": incumbent,
@@ -294,92 +278,78 @@ def gate(run: Run, verdict: Callable[[], Verdict]) -> None:
         files = {"candidate": str(run.weights), "incumbent": run.config.incumbent}
         runs = {"training_runs": run.config.seeds}
         facts = {"files": files, **runs, "made_by": run.provenance()}
-        found = verdict()
-        write_verdict(path, found, run.config.gate, facts)
+        write_verdict(path, verdict, run.config.gate, facts)
         drives = (run.folder / "likeness.txt").read_text()
-        write_whole(run.tables, f"{drives}\n{format_verdict(found)}\n")
+        write_whole(run.tables, f"{drives}\n{format_verdict(verdict)}\n")
 
     run.stage("gate", inputs, [path, run.tables], work)
+    return verdict
 
 
 def report(
-    run: Run,
-    verdict: Callable[[], Verdict],
-    dataset: Demonstrations,
-    sources: Sequence[Dataset],
+    run: Run, verdict: Verdict, dataset: Demonstrations, sources: Sequence[Dataset]
 ) -> None:
     """Draws report.html from everything before it."""
-    made_from = ("ranking.json", "suite/metrics.npz", "verdict.json")
+    config, ranking = run.config, run.folder / "ranking.json"
+    made_from = (ranking, run.metrics, run.folder / "verdict.json")
     inputs = {
-        "files": [file_sha256(run.folder / name) for name in made_from],
+        "files": [file_sha256(file) for file in made_from],
         "weights": file_sha256(run.weights),
         "incumbent": run.incumbent_hash(),
         "dataset": dataset.hash,
-        "recipe": run.config.recipe,
+        "recipe": config.recipe,
     }
-    if run.config.sweep:
-        inputs["sweep"] = file_sha256(run.config.sweep / SWEEP)
-    draw = functools.partial(_draw, run, verdict, dataset, sources)
-    run.stage("report", inputs, [run.page], draw)
+    if config.sweep:
+        inputs["sweep"] = file_sha256(config.sweep / SWEEP)
 
+    def work() -> None:
+        # of the extra [report], without which all before it can be done
+        from rcirl_jax.report.tuning_page import TuningReport, write_tuning_page
 
-def _draw(
-    run: Run,
-    verdict: Callable[[], Verdict],
-    dataset: Demonstrations,
-    sources: Sequence[Dataset],
-) -> None:
-    # of the extra [report], without which all before it can be done
-    from rcirl_jax.report.tuning_page import TuningReport, write_tuning_page
-
-    _, incumbent = suite_job(run)
-    judged, config = verdict(), run.config
-    rewards = {CANDIDATE: open_reward(str(run.weights))}
-    if known := run.incumbent_reward():
-        rewards[INCUMBENT] = known
-    seed = int(rewards[CANDIDATE].provenance["seed"])
-    write_tuning_page(
-        run.page,
-        TuningReport(
-            verdict=judged,
-            gate=config.gate,
-            suite=_suite_runs(run),
-            incumbent=incumbent,
-            ranking=from_json(read_json(run.folder / "ranking.json", "a ranking")),
-            rewards=rewards,
-            dataset=dataset,
-            replays=_replays(run, judged, sources),
-            workdir=_kept_workdir(run, seed),
-            sweep=read_sweep(config.sweep) if config.sweep else None,
-            likeness=(run.folder / "likeness.txt").read_text(),
-            training_runs=config.seeds,
-            facts={
-                "recipe": config.recipe,
-                **run.facts,
-                "stages": _noted(run, len(sources)),
-            },
-        ),
-    )
-
-
-def _noted(run: Run, sources: int) -> dict:
-    """The stages' records without `made_by`, which the page says once."""
-    imports = [f"import {number}" for number in range(sources)]
-    trained = [f"train {number}" for number in range(run.config.seeds)]
-    ranks = [f"rank {futures}" for futures in FUTURES]
-    known = run.stages.read()
-    return {
-        name: {key: x for key, x in known[name].items() if key != "made_by"}
-        for name in (
-            *(*imports, *trained, "export"),
-            *(*ranks, "simulate", "likeness", "gate"),
+        rewards = {CANDIDATE: open_reward(str(run.weights))}
+        if known := run.incumbent_reward():
+            rewards[INCUMBENT] = known
+        stages = run.stages.read()
+        # the training run of the candidate, by the notes of its stage
+        seed = int(rewards[CANDIDATE].provenance["seed"])
+        noted = stages.get(f"train {seed}", {}).get("inputs", {})
+        decided = {name: noted.get(name) for name in ("config", "dataset", *run.code())}
+        names = (
+            *(f"import {number}" for number in range(len(sources))),
+            *(f"train {number}" for number in range(config.seeds)),
+            "export",
+            *(f"rank {futures}" for futures in FUTURES),
+            *("simulate", "likeness", "gate"),
         )
-        if name in known
-    }
+        shown = {  # without `made_by`, which the page says once
+            name: {key: x for key, x in stages[name].items() if key != "made_by"}
+            for name in names
+            if name in stages
+        }
+        write_tuning_page(
+            run.page,
+            TuningReport(
+                verdict=verdict,
+                gate=config.gate,
+                suite=read_runs(run.metrics),
+                incumbent=suite_job(run)[1],
+                ranking=from_json(read_json(ranking, "a ranking")),
+                rewards=rewards,
+                dataset=dataset,
+                replays=_replays(run, verdict, sources),
+                workdir=_folder_of(run, decided, seed),
+                sweep=read_sweep(config.sweep) if config.sweep else None,
+                likeness=(run.folder / "likeness.txt").read_text(),
+                training_runs=config.seeds,
+                facts={"recipe": config.recipe, **run.facts, "stages": shown},
+            ),
+        )
+
+    run.stage("report", inputs, [run.page], work)
 
 
 def _replays(run: Run, verdict: Verdict, sources: Sequence[Dataset]) -> list[Replay]:
-    """Cases worth a look, then a few held-out drives beside the human."""
+    """Replays cases worth a look, then a few held-out drives beside the human."""
     job, incumbent = suite_job(run)
     drivers = [row for row in job.rows() if row.name in (CANDIDATE, incumbent)]
     shown = verdict.look_at[:REPLAYS] or job.cases().ids[:2]

@@ -47,18 +47,16 @@ def begun(run, monkeypatch):
 def test_the_time_left_grows_with_what_is_not_compiled(monkeypatch):
     run = a_run()
     time, clock = begun(run, monkeypatch)
-    with clock.stage("import", None):
-        time.now += 30.0
-        run.done.append("import 0")
-    with clock.stage("demonstrate", WORK):
-        time.now += 300.0
-        run.compiled.append(120.0)  # of the rest 60 s are usual, 120 s more
-        run.done.append("demonstrate 0")
-    with clock.stage("train", WORK):
-        time.now += 240.0
-        run.done.append("train 0")
-    with clock.stage("rank", WORK):
-        pass
+    for name, work, took, compiled in (
+        ("import", None, 30.0, 0.0),
+        ("demonstrate", WORK, 300.0, 120.0),  # of the rest 60 s are usual, 120 s more
+        ("train", WORK, 240.0, 0.0),
+    ):
+        clock.begin(name, work)
+        time.now += took
+        run.compiled.append(compiled)
+        run.done.append(f"{name} 0")
+    clock.begin("rank", WORK)
     left = "left, compiling not counted"
     assert run.said == [
         "stage 1 of 4: import; 0 s so far",
@@ -71,12 +69,10 @@ def test_the_time_left_grows_with_what_is_not_compiled(monkeypatch):
 def test_stages_of_an_earlier_run_take_no_time_until_something_changes(monkeypatch):
     run = a_run("demonstrate 1", "export")
     _, clock = begun(run, monkeypatch)
-    with clock.stage("demonstrate", WORK):
-        pass
+    clock.begin("demonstrate", WORK)
     assert " about 1 min left" in run.said[-1]
     run.done.append("demonstrate learner 1")
-    with clock.stage("train", WORK):
-        pass
+    clock.begin("train", WORK)
     assert " about 3 min left" in run.said[-1]
 
 
@@ -99,7 +95,7 @@ def test_what_to_do_next_without_a_report_is_to_have_one(tmp_path):
     run = types.SimpleNamespace(weights="w", tables="t", folder=tmp_path)
     verdict = types.SimpleNamespace(decision="ship", sentence="Ship.", look_at=("a@0",))
 
-    def last(*page):
+    def last(page):
         return loop._ending(run, verdict, page, "b@0").splitlines()[-1]
 
     assert "rcirl replay --weights=w --case=a@0" in last("report to open: r")
