@@ -121,6 +121,6 @@ def _likeness(report: LikenessReport, made_by: dict) -> None:
     """Every row, and the recorded human, over held-out drives."""
     folder = Path(_OUTPUT.value)
     write_whole(folder / "table.txt", report.text())
-    write_json(folder / "likeness.json", {**report.as_dict(), "made_by": made_by})
+    write_json(folder / "likeness.json", {**report.facts, "made_by": made_by})
     print(report.text())
     print(f"written: {_OUTPUT.value}/table.txt, likeness.json")

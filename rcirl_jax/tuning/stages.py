@@ -238,7 +238,7 @@ def simulate(run: Run, sources: Sequence[Dataset]) -> None:
         drives = held_out(sources, run.config.drives)
         found = held_out_likeness(drives, job.rows(), job.plan_every)
         write_arrays(arrays, found.likeness)
-        write_json(body, {**found.as_dict(), "made_by": run.provenance()})
+        write_json(body, {**found.facts, "made_by": run.provenance()})
         write_whole(text, found.text())
 
     inputs = {

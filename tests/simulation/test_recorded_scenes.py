@@ -172,8 +172,8 @@ def test_distances_are_those_of_the_drives(tmp_path):
     mean = float(np.mean(apart(CLOCK_S[1:])))
     assert coasted.distance[0] == pytest.approx(mean, abs=0.02)
     assert report.rows[RECORDED_HUMAN].distance.max() < 0.02
-    assert report.unlikeness(RECORDED_HUMAN)["acceleration"] == 0.0
-    minus = report.differences("coast")["IDM"].mean
+    assert report.facts["rows"][RECORDED_HUMAN]["unlikeness"]["acceleration"] == 0.0
+    minus = report.facts["rows"]["coast"]["minus"]["IDM"]["mean"]
     apart_of = report.distance["coast"] - report.distance["IDM"]
     assert minus == pytest.approx(float(apart_of.mean()))
     assert f"{minus:+.2f} [" in report.text()
@@ -192,7 +192,7 @@ def test_distances_are_those_of_the_drives(tmp_path):
         ("names", np.array([1, 2]), "names: int64 (2,), not texts"),
         ("distance", np.ones((2, 2)), "distance: float64 (2, 2), not (2, 3)"),
         ("clusters", np.ones(3), "clusters: float64 (3,), not (3,)"),
-        ("distance", -np.ones((2, 3)), "likeness: a: drive 0: -1.0"),
+        ("distance", -np.ones((2, 3)), "distance: below 0, NaN or infinity"),
         ("distance", None, "expected distances as written"),
     ],
 )

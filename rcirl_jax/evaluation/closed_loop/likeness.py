@@ -14,6 +14,7 @@ numpy, float64.
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -33,7 +34,6 @@ from rcirl_jax.evaluation.closed_loop.summary import text_table
 from rcirl_jax.evaluation.gate.types import Likeness
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
-    Difference,
     combine_seeds,
     paired_difference,
 )
@@ -89,25 +89,19 @@ class LikenessReport:
         """The distances in the form that the gate reads."""
         return Likeness(distance=self.distance, clusters=self.clusters)
 
-    def unlikeness(self, name: str) -> dict[str, float]:
-        """Jensen-Shannon distance to the human's distribution, by HISTOGRAMS."""
-        mine, human = self.rows[name].samples, self.rows[RECORDED_HUMAN].samples
-        return {key: jensen_shannon(mine[key], human[key], key) for key in HISTOGRAMS}
+    @functools.cached_property
+    def facts(self) -> dict:
+        """All numbers, for a JSON file.
 
-    def differences(self, name: str) -> dict[str, Difference]:
-        """Row minus each reference, m, clustered by vehicle; below 0 is nearer."""
+        A row's `minus` are its differences to `REFERENCES`, clustered by vehicle;
+        below 0 is nearer. `unlikeness` is the Jensen-Shannon distance to the human's
+        distributions of `HISTOGRAMS`.
+        """
         bootstrap, found = ClusterBootstrap(self.clusters), self.distance
-        others = [n for n in REFERENCES if n in found and n != name]
-        return {n: paired_difference(found[name], found[n], bootstrap) for n in others}
-
-    def as_dict(self) -> dict:
-        """For a JSON file."""
-        bootstrap = ClusterBootstrap(self.clusters)
-        human = self.rows[RECORDED_HUMAN]
-        body = {}
+        human, body = self.rows[RECORDED_HUMAN], {}
         for name, row in self.rows.items():
             mean = combine_seeds(row.distance[None], bootstrap)
-            speed = float(np.mean(row.mean_speed) / np.mean(human.mean_speed))
+            others = [n for n in REFERENCES if n in found and n != name]
             body[name] = {
                 "distance_m": {"mean": mean.value, "low": mean.low, "high": mean.high},
                 "at_m": {
@@ -115,16 +109,20 @@ class LikenessReport:
                     for i, t in enumerate(TIMES_SHOWN_S)
                     if not np.isnan(row.at[:, i]).all()
                 },
-                "unlikeness": self.unlikeness(name),
-                "speed_share": speed,
+                "unlikeness": {
+                    key: jensen_shannon(row.samples[key], human.samples[key], key)
+                    for key in HISTOGRAMS
+                },
+                "speed_share": float(np.mean(row.mean_speed) / human.mean_speed.mean()),
                 "induced_braking_mps2": float(np.mean(row.induced_braking)),
                 "crashed": int(np.sum(row.crashed)),
                 "minus": {
-                    other: dataclasses.asdict(found)
-                    for other, found in self.differences(name).items()
-                }
-                if name != RECORDED_HUMAN
-                else {},
+                    other: dataclasses.asdict(
+                        paired_difference(row.distance, found[other], bootstrap)
+                    )
+                    for other in others
+                    if name != RECORDED_HUMAN
+                },
             }
         return {
             "drives": len(self.ids),
@@ -135,55 +133,50 @@ class LikenessReport:
         }
 
     def text(self) -> str:
-        """The table, nearest row first."""
-        facts = self.as_dict()
-        shown = [f"{t:g} s" for t in TIMES_SHOWN_S]
-        head = ["row", "distance m", *shown, "speed", "a", "jerk", "headway", "TTC"]
-        lines = [[*head, "induced", "crashes"]]
-        ranked = sorted(facts["rows"].items(), key=lambda x: x[1]["distance_m"]["mean"])
-        for name, row in ranked:
-            mean = row["distance_m"]
-            apart = [row["at_m"].get(f"{t:g}") for t in TIMES_SHOWN_S]
-            lines.append(
-                [
-                    name,
-                    f"{mean['mean']:.2f} [{mean['low']:.2f}, {mean['high']:.2f}]",
-                    *["" if x is None else f"{x:.2f}" for x in apart],
-                    f"{100 * row['speed_share']:.0f} %",
-                    *[f"{x:.2f}" for x in row["unlikeness"].values()],
-                    f"{row['induced_braking_mps2']:.2f}",
-                    str(row["crashed"]),
-                ]
-            )
-        table = text_table(lines[0], lines[1:])
-        title = (
-            f"Distance to the human, held out: {facts['drives']} drives of "
-            f"{facts['vehicles']} vehicles in {facts['recordings']} recordings"
-        )
-        note = (
-            "distance: mean of |s - s_human|, and at 1 to 8 s; speed: share of the "
-            "human's; a to TTC: how unlike the human's distribution, 0 to 1"
-        )
-        lines = [title, *table, note, "", *self._differences_text()]
-        return "\n".join(lines) + "\n"
-
-    def _differences_text(self) -> list[str]:
-        """Every row minus each reference; nothing where there is none."""
+        """Formats the table, nearest row first, and the differences."""
+        facts, times = self.facts, [f"{t:g}" for t in TIMES_SHOWN_S]
         known = [name for name in REFERENCES if name in self.rows]
-        rows = []
-        for name in self.distance:
-            found = self.differences(name)
-            cells = [
-                f"{d.mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]" if d else "-"
-                for d in map(found.get, known)
+        cell = "{mean:.2f} [{low:.2f}, {high:.2f}]".format_map
+        apart = "{mean:+.2f} [{low:+.2f}, {high:+.2f}]".format_map
+        rows = [
+            [
+                name,
+                cell(row["distance_m"]),
+                *(f"{row['at_m'][t]:.2f}" if t in row["at_m"] else "" for t in times),
+                f"{100 * row['speed_share']:.0f} %",
+                *(f"{x:.2f}" for x in row["unlikeness"].values()),
+                f"{row['induced_braking_mps2']:.2f}",
+                str(row["crashed"]),
             ]
-            rows.append([name, *cells])
-        title = "distance minus that of, m [95 % over vehicles]; below 0 is nearer"
-        return [title, *text_table(["row minus", *known], rows)] if known else []
+            for name, row in sorted(
+                facts["rows"].items(), key=lambda x: x[1]["distance_m"]["mean"]
+            )
+        ]
+        head = ["row", "distance m", *(f"{t} s" for t in times), "speed", "a", "jerk"]
+        head += ["headway", "TTC", "induced", "crashes"]
+        lines = [
+            f"Distance to the human, held out: {facts['drives']} drives of "
+            f"{facts['vehicles']} vehicles in {facts['recordings']} recordings",
+            *text_table(head, rows),
+            "distance: mean of |s - s_human|, and at 1 to 8 s; speed: share of the "
+            "human's; a to TTC: how unlike the human's distribution, 0 to 1",
+            "",
+        ]
+        if known:
+            minus = {name: facts["rows"][name]["minus"] for name in self.distance}
+            rows = [
+                [name, *(apart(found[n]) if n in found else "-" for n in known)]
+                for name, found in minus.items()
+            ]
+            lines += [
+                "distance minus that of, m [95 % over vehicles]; below 0 is nearer",
+                *text_table(["row minus", *known], rows),
+            ]
+        return "\n".join(lines) + "\n"
 
 
 def write_arrays(path: Path, known: Likeness) -> None:
-    """The distances as an npz file, whole or not at all."""
+    """Writes the distances as an npz file, whole or not at all."""
     table = np.array(list(known.distance.values()), np.float64)
     names = np.array(list(known.distance))
     arrays = {"names": names, "distance": table, "clusters": known.clusters}
@@ -191,7 +184,7 @@ def write_arrays(path: Path, known: Likeness) -> None:
 
 
 def read_arrays(path: Path) -> Likeness:
-    """Distances written by `write_arrays`.
+    """Reads distances written by `write_arrays`.
 
     Raises:
       InputError: no such file, damaged, or not as written.
@@ -208,7 +201,7 @@ def read_arrays(path: Path) -> Likeness:
 
 
 def jensen_shannon(a: np.ndarray, b: np.ndarray, name: str) -> float:
-    """Jensen-Shannon distance of two samples' histograms, 0 (equal) to 1.
+    """Returns the Jensen-Shannon distance of two histograms, 0 (equal) to 1.
 
     Logarithms are of base 2. Two samples without a value are equal.
 
@@ -232,7 +225,7 @@ def jensen_shannon(a: np.ndarray, b: np.ndarray, name: str) -> float:
 def held_out_likeness(
     drives: HeldOut, rows: Sequence[Row], plan_every: int = 1
 ) -> LikenessReport:
-    """Drive every row, and the recorded human, over the held-out drives.
+    """Drives every row, and the recorded human, over the held-out drives.
 
     Args:
       drives: of `simulation.recorded.held_out`.
@@ -267,7 +260,7 @@ def held_out_likeness(
 
 
 def _driven(row: Row, drives: HeldOut, plan_every: int = 1) -> Driven:
-    """One row's drives, measured against the humans of the cases."""
+    """Drives one row and measures it against the humans of the cases."""
     count = len(drives.ids)
     fill = np.minimum(np.arange(-(-count // LANES) * LANES), count - 1)
     cases = jax.tree.map(lambda x: np.asarray(x)[fill], drives.cases)
