@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation import baselines
 from rcirl_jax.evaluation.baselines import (
     DRIVER,
     HAND_SET,
@@ -31,11 +30,9 @@ from rcirl_jax.evaluation.ranking.score import (
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm, closeness, idm_trajectory
 from rcirl_jax.reward import (
     TUNABLE,
-    TUNED_ROW,
     LatticeCost,
     lattice_cost,
     tuned,
-    weighted_cost,
 )
 from rcirl_jax.reward.hand import LatticeTerms
 from rcirl_jax.sampling import SamplerConfig, num_candidates, sample
@@ -45,7 +42,6 @@ from tests.helpers.stored import long_rows
 
 D = len(TUNABLE)
 SMALL = SamplerConfig(num_random=16, cruise_times=(4.0,), edge_times=(4.0,))
-HIDDEN = np.array([-2.0, 1.5, -2.0, 1.5, 0.0, -1.0, 2.0, -0.7])
 SCENES = 40
 INDEX = np.arange(SCENES)
 
@@ -72,13 +68,10 @@ def search(function, budget, seed=0, d=D, by="cma"):
     return tune(function, np.zeros(d), 0.5, budget, seed, by)
 
 
-def test_cma_es_finds_the_minimum_of_a_shifted_sphere():
+def test_searches_find_the_minimum_of_a_shifted_sphere():
     best, value = search(Counted(sphere), 1500)
     np.testing.assert_allclose(best, np.arange(D) / 3.0, atol=1e-3)
     assert value == sphere(best) < 1e-6
-
-
-def test_tpe_comes_near_the_minimum_of_a_shifted_sphere_within_its_box():
     counted = Counted(sphere)
     best, value = search(counted, 120, d=3, by="optuna")
     assert value == sphere(best) < 0.3 * sphere(np.zeros(3))
@@ -86,7 +79,7 @@ def test_tpe_comes_near_the_minimum_of_a_shifted_sphere_within_its_box():
 
 
 @pytest.mark.parametrize("by", ["cma", "optuna"])
-@pytest.mark.parametrize("budget", [1, 2, 10, 11, 12, 57])
+@pytest.mark.parametrize("budget", [1, 11, 57])
 def test_it_takes_the_budget_and_never_more_from_the_start_on(budget, by):
     counted = Counted(sphere)
     assert search(counted, budget, by=by)[1] <= sphere(np.zeros(D))
@@ -115,15 +108,6 @@ def test_nan_is_the_worst_and_nothing_finite_is_refused(by):
         search(Counted(lambda _: np.nan), 30, by=by)
 
 
-def test_a_wall_and_flat_ground_are_no_traps():
-    """Where half the space is NaN the other half's minimum is found."""
-    walled = Counted(lambda x: sphere(x) if x[1] < 0.2 else np.nan)
-    assert search(walled, 900)[1] == pytest.approx((1.0 / 3.0 - 0.2) ** 2, rel=0.1)
-    stepped = Counted(lambda x: np.floor(sphere(x) / 50.0))
-    search(stepped, 300)
-    assert len(stepped.seen) == 300  # it starts again until the budget is spent
-
-
 def test_an_equal_budget_is_in_queries():
     class Scenes:
         def indices(self, split):
@@ -148,23 +132,10 @@ def some_rows():
     return rows, make(INDEX, rows.scene)
 
 
-def ranked(rows):
-    return valued_scenes(HAND_SET, rows, INDEX, SMALL, 8.0)
-
-
-def costs(terms, weights):
-    """[S, K], eagerly: nothing is fused."""
-    return jax.vmap(jax.vmap(lambda x: weighted_cost(x, weights)))(terms)
-
-
 def test_zeros_are_apollos_weights_exactly():
     weights = tuned(jnp.zeros(D))
     for name, value in LatticeCost().fields().items():
         assert float(getattr(weights, name)) == float(value)
-    terms = ranked(some_rows()[0]).known
-    for same in (weights, LatticeCost(**LatticeCost().fields())):
-        expected = costs(terms, LatticeCost())
-        np.testing.assert_array_equal(costs(terms, same), expected)
     rows, candidates = some_rows()
     pick = lambda tree, *at: jax.tree.map(lambda x: jnp.asarray(x)[at], tree)  # noqa: E731
     drive = pick(rows.scene, 1), pick(candidates.trajectory, 1, 20)
@@ -183,33 +154,6 @@ def test_tuned_weights_stay_in_their_ranges():
     assert float(near.collision_check) == 1e3
     with pytest.raises(ValueError, match="expected 8"):
         tuned(jnp.zeros(3))
-
-
-@functools.cache
-def driven_by_the_hidden_cost():
-    """Demonstrations whose human is the candidate that a hidden cost chooses."""
-    rows, candidates = some_rows()
-    scenes, weights = ranked(rows), tuned(jnp.asarray(HIDDEN, jnp.float32))
-    cost = costs(scenes.known, weights)
-    best = np.argmin(np.where(scenes.feasible, cost, np.inf), axis=1)
-    human = jax.tree.map(lambda x: np.asarray(x)[INDEX, best], candidates.trajectory)
-    return rows.replace(human=human)
-
-
-def test_the_search_comes_close_to_a_hidden_cost_by_what_the_report_measures():
-    rows = driven_by_the_hidden_cost()
-    scenes, cost = ranked(rows), tuned(jnp.asarray(HIDDEN, jnp.float32))
-    default, hidden = mean_fde(HAND_SET, scenes, np.stack([np.zeros(D), HIDDEN]))
-    assert default > 10.0
-    assert hidden < 0.05  # near ties
-    _, found = tune(lambda x: mean_fde(HAND_SET, scenes, x), np.zeros(D), 1.0, 400, 0)
-    assert found < 0.2 * default
-    scored = scored_baselines(rows, SMALL, {TUNED_ROW: cost, "again": LatticeCost()})
-    np.testing.assert_allclose(
-        scored.values["again"], scored.values["hand-set"], rtol=1e-5, atol=1e-3
-    )
-    chosen = [mean_chosen_fde(scored, name) for name in ("hand-set", TUNED_ROW)]
-    np.testing.assert_allclose(chosen, [default, hidden], atol=0.05)
 
 
 def random_ranked(scenes, candidates, seed=0):
@@ -305,6 +249,9 @@ def test_the_search_comes_close_to_a_hidden_driver_by_what_the_report_measures()
         scored.values["cost"], scored.values["hand-set"], rtol=1e-5, atol=1e-3
     )
     found = [mean_chosen_fde(scored, name) for name in ("IDM", TUNED_IDM_ROW)]
+    scenes = valued_scenes(HAND_SET, rows, DRIVEN, SMALL, 8.0)
+    (usual,) = mean_fde(HAND_SET, scenes, np.zeros((1, D)))
+    assert mean_chosen_fde(scored, "hand-set") == pytest.approx(usual, abs=0.05)
     scenes = valued_scenes(DRIVER, rows, DRIVEN, SMALL, 8.0)
     both = np.stack([np.zeros(len(TUNABLE_IDM)), HIDDEN_DRIVER])
     usual, hidden = mean_fde(DRIVER, scenes, both)
@@ -312,22 +259,6 @@ def test_the_search_comes_close_to_a_hidden_driver_by_what_the_report_measures()
     assert hidden < 0.05
     _, best = tune(lambda x: mean_fde(DRIVER, scenes, x), both[0], 1.0, 200, 0)
     assert best < 0.5 * usual
-
-
-def test_the_search_that_is_asked_for_is_taken(monkeypatch):
-    seen = []
-
-    def proposed(start, at_start, sigma, seed):
-        seen.append((start.size, at_start, sigma, seed))
-        while True:
-            yield np.array([HIDDEN_DRIVER])
-
-    monkeypatch.setitem(baselines.SEARCHES, "optuna", proposed)
-    far = lambda vectors: -np.abs(vectors).sum(axis=1)  # noqa: E731
-    made = Problem(objective=far, queries=1)
-    best = baselines._best(DRIVER, made, 7, 3, "optuna")
-    assert seen == [(len(TUNABLE_IDM), 0.0, baselines.SIGMA, 3)]
-    assert best.fields() == idm_of(jnp.asarray(HIDDEN_DRIVER, jnp.float32)).fields()
 
 
 def test_candidates_are_those_of_the_evaluation():

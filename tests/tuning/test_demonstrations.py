@@ -2,7 +2,6 @@
 
 import pytest
 
-from rcirl_jax.errors import InputError
 from rcirl_jax.tuning import demonstrations
 from rcirl_jax.tuning.recipes import SimulatedDemonstrations
 from tests.helpers.weights_files import random_weights
@@ -44,8 +43,3 @@ def test_a_learner_that_only_shows_where_it_gets_to_drives_alone(
     assert (asked["expert"][0] is hand_set[0]) != alone
     assert asked["stride_s"] == (plan.stride_s if alone else plan.takeover_stride_s)
     assert asked["seeds"] == {71}
-
-
-def test_weights_below_zero_are_refused():
-    with pytest.raises(InputError, match="weight: -1"):
-        SimulatedDemonstrations(expert="hand-set", weight=-1.0)

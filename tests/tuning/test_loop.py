@@ -13,9 +13,8 @@ WORK = {"demonstrate": 60.0, "train": 120.0, "rank": 60.0}
 
 @pytest.mark.parametrize(
     ("seconds", "words"),
-    [(4.4, "4 s"), (59.4, "59 s"), (59.6, "1 min"), (3599.0, "1 h 00 min"),
-     (3900.0, "1 h 05 min")],
-)  # fmt: skip
+    [(59.4, "59 s"), (59.6, "1 min"), (3599.0, "1 h 00 min")],
+)
 def test_durations_in_words(seconds, words):
     assert loop.in_words(seconds) == words
 

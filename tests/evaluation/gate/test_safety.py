@@ -128,9 +128,7 @@ def test_a_few_new_faults_are_open_and_named():
     assert verdict.sentence.endswith(
         "Next: look at the new faults; --accept those that may stay."
     )
-    text = format_verdict(verdict)
-    for case in ("family00/000@0", "family00/097@0", "family01/188@1"):
-        assert f"{case}: preventable at-fault collision" in text
+    assert "family00/097@0: preventable at-fault" in format_verdict(verdict)
 
 
 def test_a_collision_that_nobody_prevents_is_listed_and_not_counted():

