@@ -7,8 +7,8 @@ import sys
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.specs import spec_root
-from rcirl_jax.tuning.recipes import load_recipe
+from rcirl_jax.runtime.specs import load_toml, spec_root
+from rcirl_jax.tuning.recipes import load_recipe, recipe_names
 
 SIMULATED = "[simulated_demonstrations]\n"
 PAPER = spec_root() / "recipes" / "paper.toml"
