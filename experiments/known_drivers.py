@@ -9,7 +9,7 @@ import numpy as np
 
 from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns, text_table
 from rcirl_jax.evaluation.gate import types as gate
-from rcirl_jax.evaluation.gate.verdict import MIN_CLUSTERS, judge, pair_of
+from rcirl_jax.evaluation.gate.verdict import MIN_CLUSTERS, judge
 from rcirl_jax.evaluation.statistics import clopper_pearson
 from rcirl_jax.planner import rank
 from rcirl_jax.planner.plan import Plan
@@ -68,9 +68,10 @@ def tallied(runs: SuiteRuns, seeds: int, config: gate.GateConfig) -> list[dict]:
     for names in KINDS:
         same = dict.fromkeys((gate.CANDIDATE, names[1]), np.ones(MIN_CLUSTERS))
         alike = gate.Likeness(distance=same, clusters=np.arange(MIN_CLUSTERS))
-        pair = pair_of(runs, names[1], (), alike, candidate=names[0])
-        parts = [_part(pair, slice(i * size, (i + 1) * size)) for i in range(seeds)]
-        each = collections.Counter(judge(part, config).decision for part in parts)
+        pair = gate.Pair(runs=runs, mine=names[0], name=names[1], likeness=alike)
+        parts = [_part(runs, slice(i * size, (i + 1) * size)) for i in range(seeds)]
+        pairs = [dataclasses.replace(pair, runs=part) for part in parts]
+        each = collections.Counter(judge(part, config).decision for part in pairs)
         way = [float(np.sum(x.progress)) for x in (pair.candidate, pair.incumbent)]
         one = dict(zip(("candidate", "incumbent", "truth"), names, strict=True))
         one |= {"each": dict(each), "together": judge(pair, config).decision}
@@ -78,12 +79,11 @@ def tallied(runs: SuiteRuns, seeds: int, config: gate.GateConfig) -> list[dict]:
     return found
 
 
-def _part(pair: gate.Pair, at: slice) -> gate.Pair:
-    names = ("families", "ids", "reference", "preventable")
-    rest = {name: getattr(pair, name)[at] for name in names}
-    for row in ("candidate", "incumbent"):
-        rest[row] = jax.tree.map(lambda x: np.asarray(x)[at], getattr(pair, row))
-    return dataclasses.replace(pair, **rest)
+def _part(runs: SuiteRuns, at: slice) -> SuiteRuns:
+    names = ("ids", "groups", "preventable", "trivial", "way")
+    rest = {name: getattr(runs, name)[at] for name in names}
+    rows = jax.tree.map(lambda x: np.asarray(x)[at], dict(runs.rows))
+    return dataclasses.replace(runs, rows=rows, **rest)
 
 
 def table(found: Sequence[dict]) -> str:

@@ -31,8 +31,14 @@ from rcirl_jax.evaluation.closed_loop.suite import (
     drive_here,
     run_suite,
 )
-from rcirl_jax.evaluation.gate.types import CANDIDATE, INCUMBENT, GateConfig, Verdict
-from rcirl_jax.evaluation.gate.verdict import judge, pair_of, repeats
+from rcirl_jax.evaluation.gate.types import (
+    CANDIDATE,
+    INCUMBENT,
+    GateConfig,
+    Pair,
+    Verdict,
+)
+from rcirl_jax.evaluation.gate.verdict import judge, repeats
 from rcirl_jax.export.loading import (
     familiarity_of,
     open_reward,
@@ -372,7 +378,7 @@ def judged(
         recorded = held_out(sources, drives)
         report = held_out_likeness(recorded, job.rows(), job.plan_every)
     known = None if report is None else report.likeness
-    pair = pair_of(result, incumbent, config.trivial_baselines, known)
+    pair = Pair(runs=result, name=incumbent, likeness=known)
     verdict = judge(pair, config, left_out(job))
     return Judged(verdict=verdict, likeness=report, facts=result.facts)
 

@@ -17,8 +17,8 @@ from rcirl_jax.evaluation.closed_loop.likeness import (
 )
 from rcirl_jax.evaluation.closed_loop.runs import read_runs, write_runs
 from rcirl_jax.evaluation.closed_loop.suite import write_suite
-from rcirl_jax.evaluation.gate.types import CANDIDATE, INCUMBENT, Verdict
-from rcirl_jax.evaluation.gate.verdict import judge, pair_of, write_verdict
+from rcirl_jax.evaluation.gate.types import CANDIDATE, INCUMBENT, Pair, Verdict
+from rcirl_jax.evaluation.gate.verdict import judge, write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.report import format_table, from_json, to_json
@@ -256,9 +256,8 @@ def verdict_of(run: Run) -> Verdict:
     """Judges the finished simulation and held-out drives."""
     job, incumbent = suite_job(run)
     runs, known = read_runs(run.metrics), read_arrays(run.folder / "likeness.npz")
-    gate = run.config.gate
-    pair = pair_of(runs, incumbent, gate.trivial_baselines, known)
-    return judge(pair, gate, left_out(job))
+    pair = Pair(runs=runs, name=incumbent, likeness=known)
+    return judge(pair, run.config.gate, left_out(job))
 
 
 def gate(run: Run) -> Verdict:

@@ -34,12 +34,12 @@ def suite():
     rows = {HAND_SET: hand, OTHER: drives(2)}
     rows |= {name: shorter(share) for name, share in SLOWER.items()}
     rows[IDM] = broken(drives(1), np.arange(40) * 99, at_fault=1)
-    both = pair(hand, hand)
+    both = pair(hand, hand).runs
     halves = [*range(0, CASES, 2), *range(1, CASES, 2)]  # each has every family
     runs = SuiteRuns(
         rows=jax.tree.map(lambda x: np.asarray(x)[halves], rows),
         ids=tuple(both.ids[i] for i in halves),
-        groups=tuple(both.families[i] for i in halves),
+        groups=tuple(both.groups[i] for i in halves),
         preventable=np.ones(CASES, bool),
         trivial=np.zeros(CASES, bool),
         reference=IDM,

@@ -61,10 +61,7 @@ def suite_and_verdict():
         rows=runs, ids=tuple(ids), groups=tuple(names), preventable=none, trivial=none,
         reference="IDM", way=way,
     )  # fmt: skip
-    pair = Pair(
-        candidate=runs["candidate"], incumbent=runs["hand-set"], families=names,
-        ids=ids, reference=way, preventable=~none, name="hand-set",
-    )  # fmt: skip
+    pair = Pair(runs=dataclasses.replace(suite, preventable=~none), name="hand-set")
     verdict = judge(pair, GateConfig())
     return suite, dataclasses.replace(verdict, look_at=(*PLAYED, *verdict.look_at[:4]))
 

@@ -4,12 +4,13 @@ Axes: `C` cases of the suite, `D` held-out recorded drives.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
 from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
 
@@ -91,20 +92,30 @@ class Likeness:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Pair:
-    """Candidate and incumbent on the same C cases; numpy leaves [C]."""
+    """A candidate and an incumbent that drove the same suite."""
 
-    candidate: CaseMetrics
-    incumbent: CaseMetrics
-    families: Sequence[str]
-    ids: Sequence[str]
-    reference: np.ndarray  # [C] m, way of the driver that nuPlan's score compares to
-    preventable: np.ndarray  # [C] bool, `simulation.rows.preventable`
-    name: str = INCUMBENT  # of the incumbent
-    trivial_baselines: Mapping[str, CaseMetrics] = dataclasses.field(
-        default_factory=dict
-    )
+    runs: SuiteRuns  # with the trivial baselines among its rows
+    name: str = INCUMBENT  # of the incumbent's row
+    mine: str = CANDIDATE  # of the candidate's row
     # rows `CANDIDATE`, `name` and the trivial baselines
     likeness: Likeness | None = None
+
+    def __post_init__(self) -> None:
+        """Rejects names that are no rows."""
+        for name in (self.mine, self.name):
+            if name not in self.runs.rows:
+                known = ", ".join(self.runs.rows)
+                raise InputError(f"gate: {name}: expected a row of {known}")
+
+    @property
+    def candidate(self) -> CaseMetrics:
+        """The candidate's drives."""
+        return self.runs.rows[self.mine]
+
+    @property
+    def incumbent(self) -> CaseMetrics:
+        """The incumbent's drives."""
+        return self.runs.rows[self.name]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

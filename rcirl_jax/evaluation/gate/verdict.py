@@ -39,15 +39,13 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, SuiteResult
-from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns, result_hash
+from rcirl_jax.evaluation.closed_loop.summary import result_hash
 from rcirl_jax.evaluation.gate.types import (
     CANDIDATE,
-    INCUMBENT,
     Check,
     Decision,
     GateConfig,
     Kind,
-    Likeness,
     NewFault,
     Outcome,
     Pair,
@@ -71,7 +69,7 @@ from rcirl_jax.runtime.atomic_files import plain, write_json
 from rcirl_jax.simulation.families import family_title
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 from rcirl_jax.simulation.rollout import LANES
-from rcirl_jax.simulation.rows import TRIVIAL_BASELINES, Row
+from rcirl_jax.simulation.rows import Row
 from rcirl_jax.simulation.suite import drive_row, rollout_config
 
 WORST = 20  # cases named for a person to look at
@@ -85,43 +83,6 @@ RATES = ("collision_free", "min_ttc", "speed_limit", "on_road")
 CLEAN = (*RATES, "red_light", "stop_sign")  # what a clean drive holds
 # what to do where human-likeness was not measured
 TO_MEASURE = "measure human-likeness on held-out recordings (docs/gate.md)"
-
-
-def pair_of(
-    runs: SuiteRuns,
-    incumbent: str = INCUMBENT,
-    trivial: Sequence[str] = TRIVIAL_BASELINES,
-    likeness: Likeness | None = None,
-    *,
-    candidate: str = CANDIDATE,
-) -> Pair:
-    """Takes candidate, incumbent and trivial baselines from a driven suite.
-
-    Args:
-      runs: the drives.
-      incumbent: name of its row.
-      trivial: names of rows that the candidate has to be ahead of; those that the suite
-        does not have are left out.
-      likeness: distances to the human, where they were measured.
-      candidate: name of its row.
-
-    Raises:
-      InputError: the suite has no such rows.
-    """
-    for name in (candidate, incumbent):
-        if name not in runs.rows:
-            raise InputError(f"gate: {name}: expected a row of {', '.join(runs.rows)}")
-    return Pair(
-        candidate=runs.rows[candidate],
-        incumbent=runs.rows[incumbent],
-        families=runs.groups,
-        ids=runs.ids,
-        reference=np.asarray(runs.way, np.float64),
-        preventable=np.asarray(runs.preventable, bool),
-        name=incumbent,
-        trivial_baselines={n: runs.rows[n] for n in trivial if n in runs.rows},
-        likeness=likeness,
-    )
 
 
 def repeats(row: Row, result: SuiteResult, config: SuiteConfig) -> None:
@@ -153,7 +114,7 @@ def judge(pair: Pair, config: GateConfig, part: str = "") -> Verdict:
       InputError: fewer than `MIN_CASES` cases, an accepted id that is no new fault,
         or no distances of a row that human-likeness is compared with.
     """
-    count = len(pair.ids)
+    count = len(pair.runs.ids)
     if count < MIN_CASES:
         raise InputError(f"gate: {count} cases: expected at least {MIN_CASES}")
     faults = new_faults(pair, config.accept)
@@ -186,7 +147,7 @@ def judge(pair: Pair, config: GateConfig, part: str = "") -> Verdict:
         reasons=reasons,
         checks=checks,
         cases=count,
-        families=len(set(pair.families)),
+        families=len(set(pair.runs.groups)),
         new_faults=faults,
         look_at=_look_at(pair, checks, [f.case for f in faults if not f.accepted]),
         part=part,
@@ -205,7 +166,7 @@ def _look_at(
     mine, theirs = passes_of(pair.candidate), passes_of(pair.incumbent)
     way = np.asarray(pair.candidate.progress) - np.asarray(pair.incumbent.progress)
     key = (
-        8.0 * np.isin(pair.ids, new)
+        8.0 * np.isin(pair.runs.ids, new)
         + 4.0 * (~mine["clean"] & theirs["clean"])
         + np.clip(-way / np.maximum(pair.incumbent.progress, 1.0), 0.0, 1.0)
         + 0.5 * (~mine["j_station"] & theirs["j_station"])
@@ -214,12 +175,12 @@ def _look_at(
     failed = {family_of(c) for c in checks if c.outcome == "fail"}
     firsts: dict[str, int] = {}
     for i in order:
-        if pair.families[i] in failed:
-            firsts.setdefault(pair.families[i], i)
+        if pair.runs.groups[i] in failed:
+            firsts.setdefault(pair.runs.groups[i], i)
     unsafe = any(c.kind == "safety" and c.outcome != "pass" for c in checks)
-    first = [i for i in order if unsafe and pair.ids[i] in new]
+    first = [i for i in order if unsafe and pair.runs.ids[i] in new]
     found = dict.fromkeys([*first, *firsts.values(), *order])
-    return tuple(pair.ids[i] for i in list(found)[:WORST])
+    return tuple(pair.runs.ids[i] for i in list(found)[:WORST])
 
 
 def write_verdict(
@@ -274,16 +235,16 @@ def new_faults(pair: Pair, accept: tuple[str, ...] = ()) -> tuple[NewFault, ...]
     Raises:
       InputError: an accepted id is no such case.
     """
-    everywhere = np.ones(len(pair.ids), bool)
+    everywhere = np.ones(len(pair.runs.ids), bool)
     mine = offences(pair.candidate, everywhere)
     theirs = offences(pair.incumbent, everywhere)
     more = {name: mine[name] > theirs[name] for name in mine}
     found = tuple(
         NewFault(
-            case=pair.ids[i],
+            case=pair.runs.ids[i],
             faults=tuple(name for name in more if more[name][i]),
-            preventable=bool(pair.preventable[i]),
-            accepted=pair.ids[i] in accept,
+            preventable=bool(pair.runs.preventable[i]),
+            accepted=pair.runs.ids[i] in accept,
         )
         for i in np.flatnonzero(np.any(list(more.values()), axis=0)).tolist()
     )
@@ -379,9 +340,12 @@ def _no_more(
         fail    more lost than gained by McNemar's exact test, one-sided at 2.5 %
         open    neither: the cases at hand do not show it
     """
-    mine = offences(pair.candidate, pair.preventable)
-    theirs = offences(other, pair.preventable)
-    counts, total = np.isin(pair.ids, config.accept, invert=True), len(pair.ids)
+    mine = offences(pair.candidate, pair.runs.preventable)
+    theirs = offences(other, pair.runs.preventable)
+    counts, total = (
+        np.isin(pair.runs.ids, config.accept, invert=True),
+        len(pair.runs.ids),
+    )
     checks = []
     for name in mine:
         gained = int(np.sum(counts & (mine[name] < theirs[name])))
@@ -406,11 +370,11 @@ def _no_loss(pair: Pair, config: GateConfig) -> list[Check]:
     Student's t within the families as strata.
     """
     mine, theirs = passes_of(pair.candidate), passes_of(pair.incumbent)
-    count, checks = len(pair.ids), []
+    count, checks = len(pair.runs.ids), []
     for name in (*RATES, "progress"):
         margin, pairs, note = config.margins[name], None, ""
         if name == "progress":
-            strata = np.unique(pair.families, return_inverse=True)[1]
+            strata = np.unique(pair.runs.groups, return_inverse=True)[1]
             found = _clipped(within_strata(*_progress(pair), strata))
         else:
             pairs = _discordant(mine[name], theirs[name])
@@ -431,8 +395,8 @@ def _families(pair: Pair, config: GateConfig) -> list[Check]:
     needs no adjustment. It fails if a loss is detected after Holm over families; of
     progress, one of more than `MATERIAL` of the margin.
     """
-    names = np.asarray(pair.families)
-    cases = {name: names == name for name in dict.fromkeys(pair.families)}
+    names = np.asarray(pair.runs.groups)
+    cases = {name: names == name for name in dict.fromkeys(pair.runs.groups)}
     cases = {name: at for name, at in cases.items() if at.sum() > 1}
     mine, theirs = (passes_of(x)["clean"] for x in (pair.candidate, pair.incumbent))
     amounts: dict[str, list[tuple[Difference, tuple[int, int] | None]]] = {
@@ -525,8 +489,8 @@ def _trivial_baselines(pair: Pair, config: GateConfig) -> list[Check]:
         title = f"nearer to the human than {other}"
         found.append(_distance(pair, kind, f"likeness, {other}", title, other, "open"))
     for other in config.trivial_baselines:
-        if other in pair.trivial_baselines:
-            found += _no_more(kind, pair, pair.trivial_baselines[other], config, other)
+        if other in pair.runs.rows:
+            found += _no_more(kind, pair, pair.runs.rows[other], config, other)
         else:
             note = f"drive {other} on the same cases"
             title = f"as safe as {other}"
@@ -542,8 +506,8 @@ def _gains(pair: Pair, config: GateConfig) -> list[Check]:
     `config.gain` fails: no gain elsewhere pays for it. Progress has its own margin
     (`_no_loss`), human-likeness its own check (`_likeness`).
     """
-    families, index = np.unique(pair.families, return_inverse=True)
-    bootstrap, few = ClusterBootstrap(family_clusters(pair.families)), ""
+    families, index = np.unique(pair.runs.groups, return_inverse=True)
+    bootstrap, few = ClusterBootstrap(family_clusters(pair.runs.groups)), ""
     if families.size < MIN_CLUSTERS:
         few = (
             f"{families.size} families: too few for an interval over families"
@@ -560,7 +524,7 @@ def _gains(pair: Pair, config: GateConfig) -> list[Check]:
         elif name == "progress":
             both = _progress(pair)
         else:  # nuPlan's score
-            way = jnp.asarray(pair.reference)
+            way = jnp.asarray(pair.runs.way)
             a, b = (np.asarray(nuplan_score(m, way)[0], np.float64) for m in drives)
             both = a, b
         if few:

@@ -168,7 +168,7 @@ def _worse(check: Check, pair: Pair, crawling: bool) -> str:
     family = family_of(check)
     if not family:
         return WORDS[check.name].worse.format(**_numbers(check))
-    title, at = family_title(family), np.asarray(pair.families) == family
+    title, at = family_title(family), np.asarray(pair.runs.groups) == family
     where = f'in "{title[:1].lower()}{title[1:]}"'
     if check.lost is not None:
         net = check.lost - (check.gained or 0)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns
 from rcirl_jax.evaluation.gate.types import (
     EXIT_CODES,
     TRIVIAL_BASELINES,
@@ -60,19 +61,19 @@ def likeness(seed=0, name="incumbent", **factors):
 
 def pair(candidate, incumbent, families=FAMILIES, **more):
     names = [f"family{i * families // CASES:02d}" for i in range(CASES)]
-    values = {
-        "preventable": np.ones(CASES, bool),
-        "trivial_baselines": dict.fromkeys(TRIVIAL_BASELINES, incumbent),
-        "likeness": likeness(),
-    }
-    return Pair(
-        candidate=candidate,
-        incumbent=incumbent,
-        families=names,
-        ids=[f"{name}/{i % EACH:03d}@{i // EACH}" for i, name in enumerate(names)],
-        reference=np.full(CASES, 1000.0),
-        **{**values, **more},
+    rows = dict.fromkeys(TRIVIAL_BASELINES, incumbent)
+    values = {"preventable": np.ones(CASES, bool), "rows": rows, **more}
+    known = values.pop("likeness", likeness())
+    values["rows"] |= {"candidate": candidate, "incumbent": incumbent}
+    runs = SuiteRuns(
+        ids=tuple(f"{name}/{i % EACH:03d}@{i // EACH}" for i, name in enumerate(names)),
+        groups=tuple(names),
+        trivial=np.zeros(CASES, bool),
+        reference="IDM",
+        way=np.full(CASES, 1000.0),
+        **values,
     )
+    return Pair(runs=runs, likeness=known)
 
 
 def broken(metrics, cases, **values):
@@ -209,12 +210,11 @@ def test_a_gain_does_not_pay_for_comfort():
 
 def part_of(whole, at):
     """The same pair on some of its cases."""
-    names = ("families", "ids", "reference", "preventable")
-    parts = {name: getattr(whole, name)[at] for name in names}
-    rows = {"candidate": whole.candidate, "incumbent": whole.incumbent}
-    parts |= jax.tree.map(lambda x: np.asarray(x)[at], rows)
-    trivial = jax.tree.map(lambda x: np.asarray(x)[at], whole.trivial_baselines)
-    return dataclasses.replace(whole, trivial_baselines=trivial, **parts)
+    names = ("groups", "ids", "way", "preventable", "trivial")
+    parts = {name: getattr(whole.runs, name)[at] for name in names}
+    rows = jax.tree.map(lambda x: np.asarray(x)[at], dict(whole.runs.rows))
+    runs = dataclasses.replace(whole.runs, rows=rows, **parts)
+    return dataclasses.replace(whole, runs=runs)
 
 
 def test_too_few_cases_cannot_be_judged():
@@ -266,9 +266,7 @@ def test_sentences_fit_three_lines_however_much_is_wrong():
     bad = broken(bad, slice(0, 3000), at_fault=1, red_lights=1, drivable=0)
     for mine, theirs in ((bad, drives()), (drives(), bad), (drives(), drives())):
         for known in (None, likeness()):
-            verdict = judge(
-                pair(mine, theirs, likeness=known, trivial_baselines={}), GateConfig()
-            )
+            verdict = judge(pair(mine, theirs, likeness=known, rows={}), GateConfig())
             assert len(textwrap.wrap(verdict.sentence, 100)) <= 3
             assert "..." not in verdict.sentence
 

@@ -184,7 +184,7 @@ def test_what_was_not_measured_is_open_and_says_what_to_do():
     ]
     assert "Next: measure human-likeness" in verdict.sentence
     assert "not measured" in format_verdict(verdict)
-    verdict = judge(pair(mine, drives(), trivial_baselines={}), GateConfig())
+    verdict = judge(pair(mine, drives(), rows={}), GateConfig())
     assert verdict.decision == "could not judge"
     assert "drive constant V on the same cases" in verdict.reasons[0]
 
@@ -192,7 +192,7 @@ def test_what_was_not_measured_is_open_and_says_what_to_do():
 def test_behind_a_trivial_baseline_in_safety_is_refused():
     mine = smoother(broken(drives(), spread(12), red_lights=1))
     trivial = {"constant V": mine, "+velocity": drives()}
-    verdict = judge(pair(mine, mine, trivial_baselines=trivial), GateConfig())
+    verdict = judge(pair(mine, mine, rows=trivial), GateConfig())
     assert failed(verdict) == {"red_light, +velocity"}
     assert "is not as safe as +velocity: red lights run" in verdict.sentence
 
