@@ -134,19 +134,10 @@ def test_paired_difference_sees_what_the_scenes_share():
     assert mirrored.p == found.p
 
 
-def test_no_difference_has_p_one_and_null_p_values_are_uniform():
-    clusters = np.repeat(np.arange(30), 2)
+def test_no_difference_has_p_one():
     x = np.random.default_rng(7).normal(size=60)
-    same = paired_difference(x, x, clusters)
+    same = paired_difference(x, x, np.repeat(np.arange(30), 2))
     assert (same.mean, same.se, same.p) == (0.0, 0.0, 1.0)
-    rng = np.random.default_rng(8)
-    p = []
-    for i in range(250):
-        d, vehicles = clustered(rng)
-        bootstrap = ClusterBootstrap(vehicles, 400, seed=i)
-        p.append(paired_difference(d, np.zeros(d.size), bootstrap).p)
-    assert 0.01 <= np.mean(np.array(p) < 0.05) <= 0.11
-    assert np.mean(np.array(p) < 0.5) == pytest.approx(0.5, abs=0.1)
 
 
 def test_paired_difference_counts_the_runs_of_both_sides():
@@ -160,10 +151,6 @@ def test_paired_difference_counts_the_runs_of_both_sides():
 
 
 def test_median_interval_holds_the_median():
-    x, clusters = clustered(np.random.default_rng(10))
-    found = bootstrap_median(x, clusters)
-    assert found.value == np.median(x)
-    assert found.low < found.value < found.high
     # binomial order statistics for independent scenes, as a closed form
     y = np.sort(np.random.default_rng(11).exponential(size=200))
     got = bootstrap_median(y, np.arange(200))

@@ -193,23 +193,14 @@ def test_rates_at_the_ends_carry_the_exact_bound_of_vehicles(report):
 
 
 @pytest.mark.parametrize("width", [100, 120])
-def test_table_fits_lines_up_and_has_the_numbers_of_the_report(report, width):
-    lines = format_table(report, width).splitlines()
-    assert max(len(line) for line in lines) <= width
-    table = lines[: next(i for i, x in enumerate(lines) if x.startswith("Paired"))]
-    blocks = [i for i, line in enumerate(table) if line == ""]
-    assert len(blocks) >= 3
-    for at, end in itertools.pairwise(blocks):
-        rows = [line for line in table[at + 3 : end] if not line.startswith("  sd")]
-        order = ("rc-irl", "twin", *(x for x in BASELINE_ROWS if x in report.rows))
-        assert all(n.startswith(o) for n, o in zip(rows, order, strict=True))
-        assert len({len(line) for line in (table[at + 1], *rows)}) == 1  # right-aligned
-    text = "\n".join(lines)
+def test_table_fits_and_has_the_numbers_of_the_report(report, width):
+    text = format_table(report, width)
+    assert max(len(line) for line in text.splitlines()) <= width
     found = report.rows["hand-set"]["top1_fde"]
     assert f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]" in text
     for c in report.comparisons:
-        if c.row not in BASELINE_ROWS and c.metric == "top1_fde":
-            assert f"{c.difference.mean:+.3f} [" in text
+        shown = f"{c.difference.mean:+.3f} [" in text
+        assert shown or c.row in BASELINE_ROWS or c.metric != "top1_fde"
     bound = 100.0 - 100.0 * 0.05 ** (1.0 / VEHICLES)
     assert f"0 (<= {bound:.1f})" in text
     assert f"100 (>= {100.0 - bound:.1f})" in text
