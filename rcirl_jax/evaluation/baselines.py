@@ -318,14 +318,6 @@ def _mean_fde(
     return jnp.mean(jax.lax.map(of_scene, scenes), axis=0)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Problem:
-    """An objective of a baseline's parameters."""
-
-    objective: Objective  # [n, d] -> [n], lower is better
-    queries: int  # candidates looked at in one evaluation of one vector
-
-
 _seen = jax.jit(jax.vmap(with_predicted_futures))
 
 
@@ -335,7 +327,7 @@ def problem(
     setup: RankingSetup,
     max_scenes: int,
     seed: int = 0,
-) -> Problem:
+) -> tuple[Objective, int]:
     """Makes the objective: mean FDE [m] of the candidate that a baseline values most.
 
     The candidates and distances are those of `evaluate_ranking`; like there, a scene
@@ -349,6 +341,9 @@ def problem(
       max_scenes: at most so many, drawn by the seed.
       seed: of the draw.
 
+    Returns:
+      The objective, and the candidates looked at in one evaluation of one vector.
+
     Raises:
       InputError: no scene of the split covers the horizon.
     """
@@ -361,43 +356,17 @@ def problem(
     scenes = valued_scenes(kind, rows, index[chosen], setup.sampler, setup.horizon_s)
     on_path = setup.sampler.mode == "speed"
     objective = functools.partial(mean_fde, kind, scenes, on_path=on_path)
-    return Problem(objective=objective, queries=int(scenes.fde.size))
-
-
-def learner_budget(
-    dataset: Demonstrations, sampler: SamplerConfig, epochs: int, problem: Problem
-) -> int:
-    """Returns the evaluations of a problem with the queries of a learner's training.
-
-    The learner compares K candidates with the human in each of S scenes, E times; an
-    evaluation of one vector looks at `problem.queries` Q: floor(S K E / Q).
-
-    Args:
-      dataset: the learner's.
-      sampler: the learner's.
-      epochs: the learner's.
-      problem: what is tuned on.
-
-    Raises:
-      InputError: less than one evaluation.
-    """
-    queries = dataset.indices("train").size * num_candidates(sampler) * epochs
-    if queries < problem.queries:
-        raise InputError(
-            f"epochs: {epochs}: {queries:,} queries: expected at least the "
-            f"{problem.queries:,} of one evaluation"
-        )
-    return queries // problem.queries
+    return objective, int(scenes.fde.size)
 
 
 # ---------------------------------------------------------------- rows
 
 
 def _best(
-    kind: Tunable, made: Problem, budget: int, seed: int, search: str
+    kind: Tunable, objective: Objective, budget: int, seed: int, search: str
 ) -> Baseline:
     start = np.zeros(len(kind.names))
-    best, _ = tune(made.objective, start, SIGMA, budget, seed, search)
+    best, _ = tune(objective, start, SIGMA, budget, seed, search)
     return kind.baseline(jnp.asarray(best, jnp.float32))
 
 
@@ -412,6 +381,10 @@ def tuned_baselines(
 ) -> dict[str, list[Baseline]]:
     """Tunes the three rows, one search per seed each.
 
+    A learner compares K candidates with the human in each of S scenes, E times; an
+    evaluation of one vector looks at Q: the rows that have the queries of a learner's
+    training are searched with floor(S K E / Q) evaluations.
+
     Args:
       dataset: the learners'; only its training split is read.
       setup: sampler and horizon of the comparison.
@@ -419,8 +392,12 @@ def tuned_baselines(
       seeds: of the searches and their drawn scenes.
       long: evaluations of the long row; 0 leaves it out.
       search: one of `SEARCHES`.
+
+    Raises:
+      InputError: less than one evaluation.
     """
     own = dataclasses.replace(setup, split="train")
+    queries = dataset.indices("train").size * num_candidates(setup.sampler) * epochs
     # row -> what is tuned, scenes, evaluations
     searches = {
         TUNED_IDM_ROW: (DRIVER, TUNING_SCENES, 0),
@@ -431,9 +408,14 @@ def tuned_baselines(
     found: dict[str, list[Baseline]] = {row: [] for row in searches}
     for row, (kind, scenes, evaluations) in searches.items():
         for seed in seeds:
-            made = problem(kind, dataset, own, scenes, seed)
-            budget = evaluations or learner_budget(dataset, setup.sampler, epochs, made)
-            found[row].append(_best(kind, made, budget, seed, search))
+            objective, each = problem(kind, dataset, own, scenes, seed)
+            budget = evaluations or queries // each
+            if not budget:
+                raise InputError(
+                    f"epochs: {epochs}: {queries:,} queries: expected at least the "
+                    f"{each:,} of one evaluation"
+                )
+            found[row].append(_best(kind, objective, budget, seed, search))
     return found
 
 
@@ -452,8 +434,8 @@ def tune_idm(
       search: one of `SEARCHES`.
     """
     own = dataclasses.replace(setup, split="train")
-    made = problem(DRIVER, dataset, own, LONG_SCENES)
-    found = _best(DRIVER, made, evaluations, 0, search).fields()
+    objective, _ = problem(DRIVER, dataset, own, LONG_SCENES)
+    found = _best(DRIVER, objective, evaluations, 0, search).fields()
     return Idm(**{name: float(value) for name, value in found.items()})
 
 

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation import baselines
 from rcirl_jax.evaluation.baselines import (
     DRIVER,
     HAND_SET,
     REACH,
     TUNABLE_IDM,
-    Problem,
     ValuedScenes,
     as_numbers,
     idm_of,
-    learner_budget,
     mean_fde,
     tune,
+    tuned_baselines,
     valued_scenes,
 )
 from rcirl_jax.evaluation.ranking.score import (
@@ -108,17 +108,21 @@ def test_nan_is_the_worst_and_nothing_finite_is_refused(by):
         search(Counted(lambda _: np.nan), 30, by=by)
 
 
-def test_an_equal_budget_is_in_queries():
+def test_an_equal_budget_is_in_queries(monkeypatch):
     class Scenes:
         def indices(self, split):
             return np.arange(2000)
 
-    each = num_candidates(SMALL)
-    problem = Problem(objective=sphere, queries=256 * each)
-    assert learner_budget(Scenes(), SMALL, 20, problem) == 2000 * 20 // 256
-    much = Problem(objective=sphere, queries=40_000 * each + 1)
-    with pytest.raises(InputError, match=r"epochs: 20: .* queries: expected"):
-        learner_budget(Scenes(), SMALL, 20, much)
+    each, budgets = num_candidates(SMALL), []
+    monkeypatch.setattr(baselines, "problem", lambda *_: (sphere, 256 * each))
+    monkeypatch.setattr(baselines, "_best", lambda *given: budgets.append(given[2]))
+    rows = functools.partial(
+        tuned_baselines, Scenes(), RankingSetup(sampler=SMALL), seeds=[0], long=7
+    )
+    rows(epochs=20)
+    assert budgets == [2000 * 20 // 256, 2000 * 20 // 256, 7]
+    with pytest.raises(InputError, match=r"epochs: 0: 0 queries: expected"):
+        rows(epochs=0)
 
 
 # -------------------------------------------------------------------- the cost
