@@ -68,10 +68,13 @@ def search(function, budget, seed=0, d=D, by="cma"):
     return tune(function, np.zeros(d), 0.5, budget, seed, by)
 
 
-def test_searches_find_the_minimum_of_a_shifted_sphere():
+def test_cma_es_finds_the_minimum_of_a_shifted_sphere():
     best, value = search(Counted(sphere), 1500)
     np.testing.assert_allclose(best, np.arange(D) / 3.0, atol=1e-3)
     assert value == sphere(best) < 1e-6
+
+
+def test_tpe_comes_near_the_minimum_of_a_shifted_sphere_within_its_box():
     counted = Counted(sphere)
     best, value = search(counted, 120, d=3, by="optuna")
     assert value == sphere(best) < 0.3 * sphere(np.zeros(3))
