@@ -30,7 +30,7 @@ drives.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -329,7 +329,7 @@ def _clipped(found: Difference, high: float = np.inf) -> Difference:
 
 def _no_more(
     kind: Kind, pair: Pair, other: CaseMetrics, config: GateConfig, trivial: str = ""
-) -> list[Check]:
+) -> Iterator[Check]:
     """Compares every offence of the candidate with another row's.
 
     A case in which the candidate commits more of one is lost, one in which it commits
@@ -346,7 +346,6 @@ def _no_more(
         np.isin(pair.runs.ids, config.accept, invert=True),
         len(pair.runs.ids),
     )
-    checks = []
     for name in mine:
         gained = int(np.sum(counts & (mine[name] < theirs[name])))
         lost = int(np.sum(counts & (mine[name] > theirs[name])))
@@ -359,18 +358,17 @@ def _no_more(
         if trivial:
             name, title = f"{name}, {trivial}", f"as safe as {trivial}: {title}"
         numbers = {"margin": margin, "pairs": pairs, "p": p, "note": note}
-        checks.append(_check(kind, name, title, found, fails, passes, **numbers))
-    return checks
+        yield _check(kind, name, title, found, fails, passes, **numbers)
 
 
-def _no_loss(pair: Pair, config: GateConfig) -> list[Check]:
+def _no_loss(pair: Pair, config: GateConfig) -> Iterator[Check]:
     """Compares rates and progress of all cases, within their margins.
 
     The suite's families are fixed: rates by Tango's interval over cases, progress by
     Student's t within the families as strata.
     """
     mine, theirs = passes_of(pair.candidate), passes_of(pair.incumbent)
-    count, checks = len(pair.runs.ids), []
+    count = len(pair.runs.ids)
     for name in (*RATES, "progress"):
         margin, pairs, note = config.margins[name], None, ""
         if name == "progress":
@@ -384,11 +382,10 @@ def _no_loss(pair: Pair, config: GateConfig) -> list[Check]:
         passes = found.low > -margin
         fails, title = found.high < 0.0 and not passes, WORDS[name].title
         numbers = {"margin": margin, "pairs": pairs, "note": note}
-        checks.append(_check("no loss", name, title, found, fails, passes, **numbers))
-    return checks
+        yield _check("no loss", name, title, found, fails, passes, **numbers)
 
 
-def _families(pair: Pair, config: GateConfig) -> list[Check]:
+def _families(pair: Pair, config: GateConfig) -> Iterator[Check]:
     """Compares clean drives and progress of each family.
 
     A family passes if its own interval lies above the margin: that all have to pass
@@ -410,7 +407,6 @@ def _families(pair: Pair, config: GateConfig) -> list[Check]:
         amounts["progress"].append((_clipped(way), None))
     adjusted = {n: holm([x.p for x, _ in found]) for n, found in amounts.items()}
     margins = {"clean drives": config.family_clean, "progress": config.family_progress}
-    checks = []
     for i, (name, at) in enumerate(cases.items()):
         for amount, margin in margins.items():
             (found, pairs), p = amounts[amount][i], float(adjusted[amount][i])
@@ -419,21 +415,18 @@ def _families(pair: Pair, config: GateConfig) -> list[Check]:
                 small, enough = MATERIAL * margin, at.sum() >= MIN_FAMILY
                 if not enough:
                     note = f"{at.sum()} cases: expected at least {MIN_FAMILY}"
-            checks.append(
-                _check(
-                    "families",
-                    f"{name}, {amount}",
-                    f"{family_title(name)}: {amount}",
-                    found,
-                    bool(enough and found.mean < -small and p < LEVEL),
-                    bool(enough and found.low > -margin),
-                    margin=margin,
-                    pairs=pairs,
-                    p=p,
-                    note=note,
-                )
+            yield _check(
+                "families",
+                f"{name}, {amount}",
+                f"{family_title(name)}: {amount}",
+                found,
+                bool(enough and found.mean < -small and p < LEVEL),
+                bool(enough and found.low > -margin),
+                margin=margin,
+                pairs=pairs,
+                p=p,
+                note=note,
             )
-    return checks
 
 
 def _nearer(pair: Pair, other: str) -> Difference | str:
@@ -482,23 +475,22 @@ def _likeness(pair: Pair) -> Check:
     return _distance(pair, "likeness", "likeness", title, pair.name, "pass")
 
 
-def _trivial_baselines(pair: Pair, config: GateConfig) -> list[Check]:
+def _trivial_baselines(pair: Pair, config: GateConfig) -> Iterator[Check]:
     """Compares with each trivial baseline: nearer to the human, and as safe."""
-    kind, found = "trivial baselines", []
+    kind = "trivial baselines"
     for other in config.trivial_baselines:
         title = f"nearer to the human than {other}"
-        found.append(_distance(pair, kind, f"likeness, {other}", title, other, "open"))
+        yield _distance(pair, kind, f"likeness, {other}", title, other, "open")
     for other in config.trivial_baselines:
         if other in pair.runs.rows:
-            found += _no_more(kind, pair, pair.runs.rows[other], config, other)
+            yield from _no_more(kind, pair, pair.runs.rows[other], config, other)
         else:
             note = f"drive {other} on the same cases"
             title = f"as safe as {other}"
-            found.append(_unmeasured(kind, f"safety, {other}", title, note))
-    return found
+            yield _unmeasured(kind, f"safety, {other}", title, note)
 
 
-def _gains(pair: Pair, config: GateConfig) -> list[Check]:
+def _gains(pair: Pair, config: GateConfig) -> Iterator[Check]:
     """Compares primary metrics and human-likeness; Holm over them.
 
     A gain has to be seen over families as clusters, and in rates by McNemar's test
@@ -538,21 +530,17 @@ def _gains(pair: Pair, config: GateConfig) -> list[Check]:
     nearer = _nearer(pair, pair.name)
     if not isinstance(nearer, str):
         rows.append(("likeness", nearer, None, nearer.p))
-    checks = []
     adjusted = holm([row[3] for row in rows]).tolist()
     for (name, found, pairs, _), p in zip(rows, adjusted, strict=True):
         judged = name not in ("progress", "likeness")
-        checks.append(
-            _check(
-                "gain",
-                name,
-                WORDS[name].title,
-                found,
-                judged and found.mean < -config.gain and p < LEVEL,
-                found.mean > 0.0 and p < LEVEL,
-                pairs=pairs,
-                p=p,
-                note="" if name == "likeness" else few,
-            )
+        yield _check(
+            "gain",
+            name,
+            WORDS[name].title,
+            found,
+            judged and found.mean < -config.gain and p < LEVEL,
+            found.mean > 0.0 and p < LEVEL,
+            pairs=pairs,
+            p=p,
+            note="" if name == "likeness" else few,
         )
-    return checks
