@@ -13,6 +13,7 @@ import hashlib
 import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -38,7 +39,7 @@ PAPER = {
 
 
 # means and worst values of a row: name -> field of the metrics, how
-PHYSICAL: dict[str, tuple[str, Callable[[np.ndarray], np.floating]]] = {
+PHYSICAL: dict[str, tuple[str, Callable[[np.ndarray], Any]]] = {
     "rms_a": ("rms_a", np.mean),
     "rms_j": ("rms_j", np.mean),
     "worst_a": ("min_a", np.min),
@@ -57,7 +58,7 @@ PHYSICAL: dict[str, tuple[str, Callable[[np.ndarray], np.floating]]] = {
     "starts": ("start_time", lambda x: np.sum(x >= 0.0)),
     "start_s_median": (
         "start_time",
-        lambda x: np.median(x[x >= 0.0]) if np.any(x >= 0.0) else np.float64(-1.0),
+        lambda x: np.median(x[x >= 0.0]) if np.any(x >= 0.0) else -1.0,
     ),
 }
 # of nuPlan's score
