@@ -1,4 +1,4 @@
-"""May this reward replace that driver? `verdict.judge` asks the checks and answers.
+"""May this reward replace that driver? `verdict.judge` runs the checks and answers.
 
-Margins and results are in `types`, the rules in `checks`, every word in `words`.
+Margins and results are in `types`, every word is in `words`.
 """
