@@ -67,9 +67,10 @@ def test_the_time_left_grows_with_what_is_not_compiled(monkeypatch):
 
 def test_stages_of_an_earlier_run_take_no_time_until_something_changes(monkeypatch):
     run = a_run("demonstrate 1", "export")
-    _, clock = begun(run, monkeypatch)
+    time, clock = begun(run, monkeypatch)
     clock.begin("demonstrate", WORK)
     assert " about 1 min left" in run.said[-1]
+    time.now += WORK["demonstrate"]
     run.done.append("demonstrate learner 1")
     clock.begin("train", WORK)
     assert " about 3 min left" in run.said[-1]
