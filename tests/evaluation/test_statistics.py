@@ -15,6 +15,8 @@ from rcirl_jax.evaluation.statistics import (
     combine_seeds,
     holm,
     paired_difference,
+    paired_rates,
+    tango_score,
 )
 
 
@@ -164,6 +166,14 @@ def test_nothing_seen_in_n_trials(n):
     exact = 1.0 - 0.05 ** (1.0 / n)
     assert clopper_pearson(0, n, 0.90)[1] == pytest.approx(exact, rel=1e-10)
     assert clopper_pearson(n, n, 0.90)[0] == pytest.approx(1.0 - exact, rel=1e-10)
+
+
+@pytest.mark.parametrize("pairs", [(0, 0), (1, 0), (9, 14), (0, 30)])
+def test_tangos_interval_ends_where_its_score_is_a_normal_quantile(pairs):
+    found, z = paired_rates(pairs, 60), stats.norm.ppf(0.975)
+    for end, score in ((found.low, z), (found.high, -z)):
+        assert float(tango_score(*pairs, 60, end)) == pytest.approx(score, abs=1e-6)
+    assert found.mean == (pairs[0] - pairs[1]) / 60
 
 
 @example([0.02, 0.022, 0.9])  # the second, alone, would be rejected at 0.05
