@@ -204,8 +204,8 @@ MALFORMED = [
     ("<osm/>", "lanelet: none"),
     ("<osm><node id='1'/></osm>", "node 1: position"),
     ("<osm><node id='1' lat='nan' lon='2'/></osm>", "node 1: position"),
-    ("<osm><node id='1' lat='90' lon='2'/></osm>", "expected at most 84, 180"),
-    ("<osm><node id='1' x='1e300' y='2'/></osm>", "expected at most 1e+08"),
+    ("<osm><node id='1' lat='90' lon='2'/></osm>", "expected numbers up to 84, 180"),
+    ("<osm><node id='1' x='1e300' y='2'/></osm>", "expected numbers up to 1e+08"),
 ]
 
 

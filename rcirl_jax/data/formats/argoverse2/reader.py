@@ -54,20 +54,16 @@ from rcirl_jax.runtime.atomic_files import read_json
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.types import Lane, Recording, Track
 
-NUMBERS = (
-    "object_category",
-    "timestep",
-    "position_x",
-    "position_y",
-    "heading",
-    "velocity_x",
-    "velocity_y",
-    "start_timestamp",
-    "end_timestamp",
-    "num_timestamps",
+COLUMNS = dict.fromkeys(
+    (
+        *("object_category", "timestep", "position_x", "position_y", "heading"),
+        *("velocity_x", "velocity_y", "start_timestamp", "end_timestamp"),
+        "num_timestamps",
+    ),
+    "number",
 )
-TEXT = ("track_id", "object_type", "scenario_id", "slice_id")
-OPTIONAL = ("slice_id",)
+COLUMNS |= dict.fromkeys(("track_id", "object_type", "scenario_id"), "text")
+OPTIONAL = {"slice_id": "text"}
 PREFIX, SUFFIX = "scenario_", ".parquet"
 STEP_S = 0.1  # s, the data set's sampling interval
 STEP_TOLERANCE = 0.01  # relative; the stamps are rounded to 64 ns
@@ -96,17 +92,22 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
 
 def _read_scenario(file: Path, spec: dict) -> Recording:
     table = _read_rows(file)
-    name = _constant(file, table, "scenario_id")
-    group = _constant(file, table, "slice_id") if "slice_id" in table else name
-    clock_notes = _check_clock(file, table)
+    (name, group), notes = _names(file, table), _check_clock(file, table)
     fields = ("position_x", "position_y", "velocity_x", "velocity_y")
     values = np.stack([table[field] for field in fields], axis=1)
     check_coordinates(file, "rows", fields, values)
     origin = local_origin(values[:, 0], values[:, 1])
-    table["position_x"] = values[:, 0] - origin[0]
-    table["position_y"] = values[:, 1] - origin[1]
-    tracks, notes = _read_tracks(file, table, spec)
-    lanes, lane_notes = _lanes(_map_file(file, name), origin, spec)
+    table["x"], table["y"] = (values[:, :2] - origin).T.copy()
+    table["speed"] = np.hypot(*values[:, 2:].T)
+    tracks, track_notes = _read_tracks(file, table, spec)
+    # the map lies beside a scenario, named by the scenario file or its id
+    stem = file.name.removeprefix(PREFIX).removesuffix(SUFFIX)
+    maps = [f"log_map_archive_{key}.json" for key in (stem, name)]
+    found = [file.parent / n for n in maps if Path(n).name == n]
+    found = [place for place in found if place.is_file()]
+    if not found:
+        raise InputError(f"{file}: map: missing: expected {maps[0]} beside it")
+    lanes, lane_notes = _lanes(found[0], origin, spec)
     return Recording(
         name=name,
         source=str(spec.get("source", "Argoverse 2 Motion Forecasting")),
@@ -116,7 +117,7 @@ def _read_scenario(file: Path, spec: dict) -> Recording:
         lanes=lanes,
         group=group,
         default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
-        notes=(*origin_notes(origin), *clock_notes, *notes, *lane_notes),
+        notes=(*origin_notes(origin), *notes, *track_notes, *lane_notes),
     )
 
 
@@ -125,21 +126,19 @@ def _read_rows(file: Path) -> dict[str, np.ndarray]:
     source = open_table(file)
     if source.layout is not None:
         raise InputError(f"{file}: parquet: text: expected Parquet")
-    needed = [name for name in (*NUMBERS, *TEXT) if name not in OPTIONAL]
-    needed += [name for name in OPTIONAL if name in source.header]
-    kinds = {name: "text" if name in TEXT else "number" for name in needed}
     stats = RowStats(path=file, unit=source.unit, allowed=0.0)
-    return read(source, fields_of(source, kinds), stats)
+    return read(source, fields_of(source, COLUMNS, OPTIONAL), stats)
 
 
-def _constant(file: Path, table: dict[str, np.ndarray], field: str) -> str:
-    """The one value of a column that says the same in every row."""
-    values = np.unique(table[field])
-    if values.size != 1 or not str(values[0]).strip():
-        raise InputError(
-            f"{file}: {field}: {list(map(str, values[:3]))}: expected one for all rows"
-        )
-    return str(values[0])
+def _names(file: Path, table: dict[str, np.ndarray]) -> list[str]:
+    """The scenario's id and its slice, if it has one; the same in every row."""
+    found = []
+    for field in ("scenario_id", "slice_id" if "slice_id" in table else "scenario_id"):
+        values = [*map(str, np.unique(table[field])[:3])]
+        if len(values) != 1 or not values[0].strip():
+            raise InputError(f"{file}: {field}: {values}: expected one for all rows")
+        found += values
+    return found
 
 
 def _check_clock(file: Path, table: dict[str, np.ndarray]) -> list[str]:
@@ -149,13 +148,8 @@ def _check_clock(file: Path, table: dict[str, np.ndarray]) -> list[str]:
         raise InputError(
             f"{file}: num_timestamps: {count:g}: expected 1 to {MAX_STEPS}"
         )
-    bad = np.flatnonzero((steps < 0) | (steps >= count) | (steps % 1.0 != 0.0))
-    if bad.size:
-        raise InputError(
-            f"{file}: row {bad[0]}: timestep: {steps[bad[0]]:g}: "
-            f"expected a whole number from 0 to {count - 1:g}"
-        )
-    table["timestep"] = steps - steps.min()
+    _check_whole(file, "timestep", steps, count - 1)
+    table["t"] = (steps - steps.min()) * STEP_S
     span = (table["end_timestamp"][0] - table["start_timestamp"][0]) * 1e-9
     step = span / max(count - 1, 1)
     if count == 1 or abs(step / STEP_S - 1.0) <= STEP_TOLERANCE:
@@ -163,39 +157,31 @@ def _check_clock(file: Path, table: dict[str, np.ndarray]) -> list[str]:
     return [f"timestamps {step:g} s apart; {STEP_S:g} s assumed, as specified"]
 
 
-def _map_file(file: Path, name: str) -> Path:
-    """The map beside a scenario, named by the scenario file or its id."""
-    stem = file.name.removeprefix(PREFIX).removesuffix(SUFFIX)
-    names = [f"log_map_archive_{key}.json" for key in (stem, name)]
-    safe = [n for n in names if Path(n).name == n]
-    for place in (file.parent / n for n in safe):
-        if place.is_file():
-            return place
-    raise InputError(f"{file}: map: missing: expected {names[0]} beside it")
+def _check_whole(file: Path, field: str, values: np.ndarray, most: float) -> None:
+    bad = np.flatnonzero((values < 0) | (values > most) | (values % 1.0 != 0.0))
+    if bad.size:
+        raise InputError(
+            f"{file}: row {bad[0]}: {field}: {values[bad[0]]:g}: "
+            f"expected a whole number from 0 to {most:g}"
+        )
 
 
 def _read_tracks(
     file: Path, table: dict[str, np.ndarray], spec: dict
 ) -> tuple[tuple[Track, ...], list[str]]:
-    category = table["object_category"]
-    bad = np.flatnonzero(~np.isin(category, np.arange(MAX_CATEGORY + 1)))
-    if bad.size:
-        raise InputError(
-            f"{file}: row {bad[0]}: object_category: {category[bad[0]]:g}: "
-            f"expected 0 to {MAX_CATEGORY}"
-        )
+    _check_whole(file, "object_category", table["object_category"], MAX_CATEGORY)
     users = np.unique(table["track_id"], return_inverse=True)[1]
     kept, notes = once_each(users, table["timestep"])
     table = {name: column[kept] for name, column in table.items()}
     category = table["object_category"]
-    speed = np.hypot(table["velocity_x"], table["velocity_y"])
     least = number(spec, "min_category", FRAGMENT)
     tracks, low, wild = [], 0, 0
     pieces = split_tracks(file, table["track_id"], table["timestep"], MAX_GAP_STEPS)
     for name, rows in pieces:
+        fastest = table["speed"][rows].max()
         if category[rows[0]] < least:
             low += 1
-        elif category[rows[0]] == FRAGMENT and speed[rows].max() > MAX_SPEED_MPS:
+        elif category[rows[0]] == FRAGMENT and fastest > MAX_SPEED_MPS:
             wild += 1
         else:
             tracks.append(_track(file, name, table, rows, spec))
@@ -219,9 +205,9 @@ def _track(
     rows: np.ndarray,
     spec: dict,
 ) -> Track:
-    found = str(table["object_type"][rows[0]])
+    found, user = str(table["object_type"][rows[0]]), name.partition("#")[0]
     kind = kind_of(f"{file}: track {name}", found, section(spec, "kinds"))
-    sizes, user = section(spec, "sizes"), name.partition("#")[0]
+    sizes = section(spec, "sizes")
     size = sizes.get(user, sizes.get(found))  # by id (the AV's), else by type
     try:
         length, width = map(float, size or ())
@@ -235,12 +221,12 @@ def _track(
         length=length,
         width=width,
         size_assumed=True,
-        t=table["timestep"][rows] * STEP_S,
-        x=table["position_x"][rows],
-        y=table["position_y"][rows],
-        heading=table["heading"][rows],
-        speed=np.hypot(table["velocity_x"][rows], table["velocity_y"][rows]),
         automated=recording_car(spec) if user == RECORDER else (),
+        t=table["t"][rows],
+        x=table["x"][rows],
+        y=table["y"][rows],
+        heading=table["heading"][rows],
+        speed=table["speed"][rows],
     )
 
 
@@ -293,18 +279,29 @@ def _lanes(
             f"{path}: lane_segments: {len(segments)}, none of type "
             f"{', '.join(wanted)}: expected at least one"
         )
-    found = [_lane(path, segment, origin) for segment in kept]
-    lanes = {lane.id: lane for lane in found}
-    if len(lanes) < len(found):
-        ((twice, _),) = collections.Counter(one.id for one in found).most_common(1)
+    ids = collections.Counter(segment.id for segment in kept)
+    if len(ids) < len(kept):
+        twice = max(ids, key=ids.__getitem__)
         raise InputError(f"{path}: lane segment {twice}: id: met twice: expected once")
-    whole = {name: lane for name, lane in lanes.items() if len(lane.centre) > 1}
+    found = [_lane(path, segment, origin) for segment in kept]
+    whole = {lane.id: lane for lane in found if len(lane.centre) > 1}
     notes = []
     if others := len(segments) - len(kept):
         notes.append(f"{others} lanes not of type {', '.join(wanted)} left out")
-    if empty := len(lanes) - len(whole):
+    if empty := len(found) - len(whole):
         notes.append(f"{empty} lanes without length left out")
-    return tuple(_same_way(lane, whole) for lane in whole.values()), notes
+    chord = {name: lane.centre[-1] - lane.centre[0] for name, lane in whole.items()}
+
+    def same_way(lane: Lane, other: str | None) -> str | None:
+        """The neighbour, if it is driven the same way."""
+        return other if other in chord and chord[lane.id] @ chord[other] > 0.0 else None
+
+    return tuple(
+        dataclasses.replace(
+            lane, left=same_way(lane, lane.left), right=same_way(lane, lane.right)
+        )
+        for lane in whole.values()
+    ), notes
 
 
 def _lane(path: Path, segment: _Segment, origin: np.ndarray) -> Lane:
@@ -315,7 +312,6 @@ def _lane(path: Path, segment: _Segment, origin: np.ndarray) -> Lane:
         check_coordinates(path, where, ("x", "y"), points)
         bounds.append(points - origin)
     centre, half = between_bounds(*bounds)
-    left, right = segment.left_neighbor_id, segment.right_neighbor_id
     return Lane(
         id=str(segment.id),
         centre=centre,
@@ -323,19 +319,6 @@ def _lane(path: Path, segment: _Segment, origin: np.ndarray) -> Lane:
         right_width=half,
         speed_limit=None,
         successors=tuple(map(str, segment.successors)),
-        left=None if left is None else str(left),
-        right=None if right is None else str(right),
+        left=str(segment.left_neighbor_id),  # "None" is no lane's
+        right=str(segment.right_neighbor_id),
     )
-
-
-def _same_way(lane: Lane, lanes: dict[str, Lane]) -> Lane:
-    """The lane without neighbours that are driven the other way."""
-    chord = lane.centre[-1] - lane.centre[0]
-
-    def kept(name: str | None) -> str | None:
-        other = lanes.get(name or "")
-        if other is None or chord @ (other.centre[-1] - other.centre[0]) <= 0.0:
-            return None
-        return name
-
-    return dataclasses.replace(lane, left=kept(lane.left), right=kept(lane.right))

@@ -11,9 +11,8 @@ regulatory elements may have an empty role.
 """
 
 import dataclasses
-import functools
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -21,9 +20,9 @@ import numpy as np
 
 from rcirl_jax.data.formats.shapes import (
     MAX_COORDINATE_M,
-    MIN_HALF_WIDTH_M,
     arc_length,
     fractions,
+    lane_between,
     resample,
 )
 from rcirl_jax.data.readers.xml import read_xml
@@ -58,8 +57,33 @@ SPEED_UNITS = {
 BACKWARDS = "-back"  # appended to the id of a two-way lanelet's other direction
 
 
+class _Element:
+    """Tags of a way or relation; its nodes or members as (kind, role, id)."""
+
+    def __init__(self, element: Element) -> None:
+        self.tags = _tags(element)
+        self.members = [
+            (one.get("type", ""), one.get("role", ""), one.get("ref", ""))
+            for one in element
+            if one.tag in ("nd", "member")
+        ]
+
+    def tag(self, key: str) -> str:
+        """Returns the value of a tag, "" if the element has none."""
+        return self.tags.get(key, "")
+
+    def of(self, kind: str, role: str) -> list[str]:
+        """Returns ids of the members of one kind (way, relation) and role."""
+        return [ref for k, r, ref in self.members if (k, r) == (kind, role)]
+
+
+def _tags(element: Element) -> dict[str, str]:
+    tags = element.iterfind("tag")
+    return {tag.get("k", ""): (tag.get("v") or "").strip() for tag in tags}
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Rule:
+class _Rule:
     """What a regulatory element says, read once for all its lanelets."""
 
     subtype: str
@@ -70,59 +94,13 @@ class Rule:
 
 
 @dataclasses.dataclass(frozen=True)
-class OsmMap:
-    """What a file holds; elements by id."""
-
-    path: Path
-    points: dict[str, np.ndarray]  # node -> [2] m
-    ways: dict[str, Element]
-    relations: dict[str, Element]
-
-    @functools.cached_property
-    def rules(self) -> dict[str, Rule]:
-        """Reads regulatory elements by id; a way that many of them name once."""
-
-        @functools.cache
-        def sign(name: str) -> str:
-            return tag_of(self.ways[name], "subtype") if name in self.ways else ""
-
-        @functools.cache
-        def ends(name: str) -> tuple[str, ...]:
-            nodes = bound(self, [name])
-            return nodes and (nodes[0], nodes[-1])
-
-        rules = {}
-        for key, element in self.relations.items():
-            if tag_of(element, "type") != "regulatory_element":
-                continue
-            subtype, text = tag_of(element, "subtype"), tag_of(element, "sign_type")
-            kinds = [sign(name) for name in members(element, "refers", "way")]
-            texts = []
-            if subtype == "speed_limit":
-                # German sign 274 carries its number: de274-60
-                numbers = [kind.rpartition("-")[2] for kind in kinds if "274-" in kind]
-                texts = [text.rpartition("274-")[2], *numbers]
-            own = dict.fromkeys(map(ends, members(element, "ref_line", "way")))
-            lines = [line_of(self, nodes) for nodes in own if nodes]
-            rules[key] = Rule(
-                subtype=subtype,
-                yields=frozenset(members(element, "yield", "relation")),
-                stops=subtype == "all_way_stop"
-                or any(kind.lower() in STOP_SIGNS for kind in (text, *kinds)),
-                lines=np.array(lines).reshape(-1, 2, 2),
-                limit=_first_speed(texts),
-            )
-        return rules
-
-
-@dataclasses.dataclass(frozen=True)
 class _Lanelet:
     """A lanelet driven one way: bounds as nodes in driving direction."""
 
     id: str
     left: tuple[str, ...]
     right: tuple[str, ...]
-    relation: Element
+    element: _Element
 
 
 def read_lanelet2(path: Path, project: Projection) -> tuple[tuple[Lane, ...], list]:
@@ -138,33 +116,33 @@ def read_lanelet2(path: Path, project: Projection) -> tuple[tuple[Lane, ...], li
     Raises:
       InputError: not well-formed, a point without a position, or no lane.
     """
-    root = read_xml(path, "osm", MAX_FILE_BYTES)
-    found = {
-        kind: {
-            element.get("id", ""): element
-            for element in root.iterfind(kind)
-            if element.get("action") != "delete"
-        }
-        for kind in ("node", "way", "relation")
-    }
-    points = _positions(path, found["node"], project)
-    world = OsmMap(path, points, found["way"], found["relation"])
+    world = _World(path, project)
     lanelets, broken, nodes = [], 0, 0
-    for name, relation in world.relations.items():
-        if tag_of(relation, "type") == "lanelet" and _for_vehicles(relation):
-            directions = list(_lanelets(world, name, relation))
-            lanelets += directions
-            broken += not directions
-            nodes += sum(len(one.left) + len(one.right) for one in directions)
-            if nodes > MAX_NODES:
-                raise InputError(
-                    f"{path}: lanelet {name[:40]}: {nodes} nodes up to it: "
-                    f"expected up to {MAX_NODES}"
-                )
+    for name, element in world.relations.items():
+        if element.tag("type") != "lanelet" or not _is_for_vehicles(element):
+            continue
+        directions = list(world.directions(name, element))
+        lanelets += directions
+        broken += not directions
+        nodes += sum(len(one.left) + len(one.right) for one in directions)
+        if nodes > MAX_NODES:
+            raise InputError(
+                f"{path}: lanelet {name[:40]}: {nodes} nodes up to it: "
+                f"expected up to {MAX_NODES}"
+            )
     if not lanelets:
         raise InputError(f"{path}: lanelet: none for vehicles: expected a road map")
     notes = [f"{broken} lanelets without two bounds left out"] if broken else []
-    return tuple(_link(world, lanelets)), notes
+    return tuple(world.lanes(lanelets)), notes
+
+
+def _is_for_vehicles(element: _Element) -> bool:
+    """By the subtype, unless participants are named one by one."""
+    start = "participant:"
+    named = {key: v for key, v in element.tags.items() if key.startswith(start)}
+    if named:
+        return any("vehicle" in key and v == "yes" for key, v in named.items())
+    return element.tag("subtype") not in NOT_FOR_VEHICLES
 
 
 def _positions(
@@ -174,73 +152,31 @@ def _positions(
     if not nodes:
         return {}
     first = next(iter(nodes.values()))
-    degrees = False
-    if first.get("x") is not None:
-        pairs = [(node.get("x"), node.get("y")) for node in nodes.values()]
-    elif tag_of(first, "local_x"):
-        pairs = [(tag_of(n, "local_x"), tag_of(n, "local_y")) for n in nodes.values()]
-    else:
-        pairs = [(node.get("lat"), node.get("lon")) for node in nodes.values()]
-        degrees = True
+    keys, limits = ("lat", "lon"), (MAX_LATITUDE, 180.0)
+    found = [node.attrib for node in nodes.values()]
+    if first.get("x") is not None or "local_x" in _tags(first):
+        keys, limits = ("x", "y"), (MAX_COORDINATE_M, MAX_COORDINATE_M)
+        if first.get("x") is None:
+            keys, found = ("local_x", "local_y"), map(_tags, nodes.values())
+    pairs = [tuple(one.get(key) or "nan" for key in keys) for one in found]
 
-    def number(text: str | None) -> float:
+    def number(text: str) -> float:
         try:
-            return float(text or "nan")
+            return float(text)
         except ValueError:
             return float("nan")
 
     values = np.array([[number(text) for text in pair] for pair in pairs])
-    wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    wrong = np.flatnonzero(~(np.abs(values) <= limits).all(axis=1))
     if wrong.size:
         name, pair = list(nodes)[wrong[0]], pairs[wrong[0]]
         raise InputError(
             f"{path}: node {name[:40]}: position: {str(pair)[:60]}: "
-            "expected two finite numbers"
+            f"expected numbers up to {limits[0]:g}, {limits[1]:g}"
         )
-    limits = (MAX_LATITUDE, 180.0) if degrees else (MAX_COORDINATE_M,) * 2
-    far = np.flatnonzero(np.any(np.abs(values) > limits, axis=1))
-    if far.size:
-        raise InputError(
-            f"{path}: node {list(nodes)[far[0]][:40]}: position: {pairs[far[0]]}: "
-            f"expected at most {limits[0]:g}, {limits[1]:g}"
-        )
-    if degrees:
+    if keys[0] == "lat":
         values = project(values[:, 0], values[:, 1])
     return dict(zip(nodes, values, strict=True))
-
-
-def _for_vehicles(relation: Element) -> bool:
-    """By the subtype, unless participants are named one by one."""
-    named = [
-        (tag.get("k", ""), tag.get("v"))
-        for tag in relation.iterfind("tag")
-        if tag.get("k", "").startswith("participant:")
-    ]
-    if named:
-        return any("vehicle" in key and value == "yes" for key, value in named)
-    return tag_of(relation, "subtype") not in NOT_FOR_VEHICLES
-
-
-def _lanelets(world: OsmMap, name: str, relation: Element) -> Iterator[_Lanelet]:
-    """The lanelet, and its other direction if it is driven both ways."""
-    sides = [bound(world, members(relation, r, "way")) for r in ("left", "right")]
-    left, right = sides
-    if len(left) < 2 or len(right) < 2:
-        return
-    first, last = world.points[left[0]], world.points[left[-1]]
-    begin, end = world.points[right[0]], world.points[right[-1]]
-    crossed = np.hypot(*(first - end)) + np.hypot(*(last - begin))
-    if np.hypot(*(first - begin)) + np.hypot(*(last - end)) > crossed:
-        right = right[::-1]
-    a, b = _resample_both(line_of(world, left), line_of(world, right))
-    along, across = np.gradient(0.5 * (a + b), axis=0), a - b
-    if not np.any(np.diff(0.5 * (a + b), axis=0)):
-        return
-    if np.sum(along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]) < 0.0:
-        left, right = left[::-1], right[::-1]
-    yield _Lanelet(name, left, right, relation)
-    if tag_of(relation, "one_way") == "no":
-        yield _Lanelet(name + BACKWARDS, right[::-1], left[::-1], relation)
 
 
 def _resample_both(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -257,85 +193,144 @@ def _resample_both(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return resample(a, at), resample(b, at)
 
 
-def _link(world: OsmMap, lanelets: list[_Lanelet]) -> Iterator[Lane]:
-    """Lanes with successors (shared ends) and neighbours (shared bounds)."""
-    starts: dict[tuple, list[str]] = {}
-    lefts: dict[tuple, str] = {}
-    rights: dict[tuple, str] = {}
-    for lanelet in lanelets:
-        starts.setdefault(_gate(world, lanelet, 0), []).append(lanelet.id)
-        lefts.setdefault(lanelet.left, lanelet.id)
-        rights.setdefault(lanelet.right, lanelet.id)
-    for lanelet in lanelets:
-        left, right = _resample_both(
-            line_of(world, lanelet.left), line_of(world, lanelet.right)
+class _World:
+    """What a file holds; elements by id.
+
+    Args:
+      path: of the file.
+      project: of `read_lanelet2`.
+    """
+
+    def __init__(self, path: Path, project: Projection) -> None:
+        self.path = path
+        nodes, ways, relations = (
+            {
+                element.get("id", ""): element
+                for element in root.iterfind(kind)
+                if element.get("action") != "delete"
+            }
+            for root in [read_xml(path, "osm", MAX_FILE_BYTES)]
+            for kind in ("node", "way", "relation")
         )
-        half = np.maximum(0.5 * np.hypot(*(left - right).T), MIN_HALF_WIDTH_M)
-        following = starts.get(_gate(world, lanelet, -1), [])
-        ends = np.stack([left[-1], right[-1]])
-        name = lanelet.id.removesuffix(BACKWARDS)
-        stop_line, stop_sign = stop_of(world, name, lanelet.relation, ends)
-        yield Lane(
-            id=lanelet.id,
-            centre=0.5 * (left + right),
-            left_width=half,
-            right_width=half,
-            speed_limit=speed_limit(world, lanelet.relation),
-            successors=tuple(s for s in following if s.removesuffix(BACKWARDS) != name),
-            left=rights.get(lanelet.left),
-            right=lefts.get(lanelet.right),
-            stop_line=stop_line,
-            stop_sign=stop_sign,
+        self.points = _positions(path, nodes, project)  # [2] m
+        self.relations = {name: _Element(one) for name, one in relations.items()}
+        self.subtypes: dict[str, str] = {}  # of ways
+        self.ways: dict[str, list[str]] = {}  # nodes; of whole ways only
+        for name, one in ways.items():
+            way = _Element(one)
+            self.subtypes[name] = way.tag("subtype")
+            refs = way.of("", "")
+            if len(refs) > 1 and all(node in self.points for node in refs):
+                self.ways[name] = refs
+        self.rules = {
+            name: self._rule(one)
+            for name, one in self.relations.items()
+            if one.tag("type") == "regulatory_element"
+        }
+
+    def _rule(self, element: _Element) -> _Rule:
+        subtype, text = element.tag("subtype"), element.tag("sign_type")
+        kinds = [self.subtypes.get(name, "") for name in element.of("way", "refers")]
+        texts = []
+        if subtype == "speed_limit":
+            # German sign 274 carries its number: de274-60
+            numbers = [kind.rpartition("-")[2] for kind in kinds if "274-" in kind]
+            texts = [text.rpartition("274-")[2], *numbers]
+        ways = [self.ways.get(name) for name in element.of("way", "ref_line")]
+        ends = dict.fromkeys((way[0], way[-1]) for way in ways if way)
+        return _Rule(
+            subtype=subtype,
+            yields=frozenset(element.of("relation", "yield")),
+            stops=subtype == "all_way_stop"
+            or any(kind.lower() in STOP_SIGNS for kind in (text, *kinds)),
+            lines=np.array([self._line(pair) for pair in ends]).reshape(-1, 2, 2),
+            limit=_first_speed(texts),
         )
 
-
-def _gate(world: OsmMap, lanelet: _Lanelet, end: int) -> tuple:
-    """Where a lanelet begins (0) or ends (-1): its two corner points."""
-    corners = [world.points[nodes[end]] for nodes in (lanelet.left, lanelet.right)]
-    return tuple(np.round(np.concatenate(corners) / SAME_PLACE_M).astype(int))
-
-
-# ------------------------------------------------- tags, members, rules
-
-
-def tag_of(element: Element, key: str) -> str:
-    """Returns the value of a tag, "" if the element has none."""
-    for tag in element.iterfind("tag"):
-        if tag.get("k") == key:
-            return (tag.get("v") or "").strip()
-    return ""
-
-
-def members(element: Element, role: str, kind: str) -> list[str]:
-    """Ids of a relation's members of one role and kind (way, relation)."""
-    return [
-        member.get("ref", "")
-        for member in element.iterfind("member")
-        if member.get("role") == role and member.get("type") == kind
-    ]
-
-
-def bound(world: OsmMap, names: list[str]) -> tuple[str, ...]:
-    """Nodes of a bound; its ways joined where they share an end. () if broken."""
-    if len(names) > MAX_WAYS:
-        raise InputError(
-            f"{world.path}: bound with way {names[0][:40]}: {len(names)} ways: "
-            f"expected up to {MAX_WAYS}"
+    def directions(self, name: str, element: _Element) -> Iterator[_Lanelet]:
+        """Yields a lanelet, and its other direction if it is driven both ways."""
+        left, right = (self._bound(element.of("way", r)) for r in ("left", "right"))
+        if len(left) < 2 or len(right) < 2:
+            return
+        (first, last), (begin, end) = (
+            (self.points[side[0]], self.points[side[-1]]) for side in (left, right)
         )
-    parts = []
-    for name in dict.fromkeys(names):
-        way = world.ways.get(name)
-        nodes = [] if way is None else [n.get("ref", "") for n in way.iterfind("nd")]
-        if len(nodes) < 2 or not all(node in world.points for node in nodes):
+        crossed = np.hypot(*(first - end)) + np.hypot(*(last - begin))
+        if np.hypot(*(first - begin)) + np.hypot(*(last - end)) > crossed:
+            right = right[::-1]
+        a, b = _resample_both(self._line(left), self._line(right))
+        along, across = np.gradient(0.5 * (a + b), axis=0), a - b
+        if not np.any(np.diff(0.5 * (a + b), axis=0)):
+            return
+        if np.sum(along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]) < 0.0:
+            left, right = left[::-1], right[::-1]
+        yield _Lanelet(name, left, right, element)
+        if element.tag("one_way") == "no":
+            yield _Lanelet(name + BACKWARDS, right[::-1], left[::-1], element)
+
+    def _line(self, nodes: Sequence[str]) -> np.ndarray:
+        """Positions [n, 2] m of nodes."""
+        return np.array([self.points[node] for node in nodes])
+
+    def _bound(self, names: list[str]) -> tuple[str, ...]:
+        """Nodes of a bound; its ways joined where they share an end. () if broken."""
+        if len(names) > MAX_WAYS:
+            raise InputError(
+                f"{self.path}: bound with way {names[0][:40]}: {len(names)} ways: "
+                f"expected up to {MAX_WAYS}"
+            )
+        if not names or not self.ways.keys() >= set(names):
             return ()
-        parts.append(nodes)
-    joined = parts.pop(0) if parts else []
-    while parts:
-        step = _extended(joined, parts)
-        if not step:
-            return ()
-        joined = step
-    return tuple(joined)
+        joined, *parts = (self.ways[name] for name in dict.fromkeys(names))
+        while parts:
+            joined = _extended(joined, parts)
+            if not joined:
+                return ()
+        return tuple(joined)
+
+    def _gate(self, lanelet: _Lanelet, end: int) -> tuple:
+        """Where a lanelet begins (0) or ends (-1): its two corner points."""
+        corners = self._line([nodes[end] for nodes in (lanelet.left, lanelet.right)])
+        return tuple(np.round(corners.ravel() / SAME_PLACE_M).astype(int))
+
+    def lanes(self, lanelets: list[_Lanelet]) -> Iterator[Lane]:
+        """Yields lanes with successors (shared ends) and neighbours (shared bounds)."""
+        starts: dict[tuple, list[str]] = {}
+        lefts: dict[tuple, str] = {}
+        rights: dict[tuple, str] = {}
+        for one in lanelets:
+            starts.setdefault(self._gate(one, 0), []).append(one.id)
+            lefts.setdefault(one.left, one.id)
+            rights.setdefault(one.right, one.id)
+        for one in lanelets:
+            left, right = _resample_both(self._line(one.left), self._line(one.right))
+            name = one.id.removesuffix(BACKWARDS)
+            own = (name, name + BACKWARDS)
+            following = [
+                other
+                for other in starts.get(self._gate(one, -1), [])
+                if other not in own
+            ]
+            refs = [ref for kind, _, ref in one.element.members if kind == "relation"]
+            rules = [self.rules[r] for r in dict.fromkeys(refs) if r in self.rules]
+            limits = [rule.limit for rule in rules if rule.limit is not None]
+            limits = limits or [_first_speed([one.element.tag("speed_limit")])]
+            ends = np.stack([left[-1], right[-1]])
+            stop_line, stop_sign = _stop_of(rules, name, ends)
+            yield lane_between(
+                one.id,
+                (left, right),
+                speed_limit=limits[-1],  # of the last rule, or of the lanelet itself
+                successors=tuple(
+                    other
+                    for other in following
+                    if other.removesuffix(BACKWARDS) != name
+                ),
+                left=rights.get(one.left),
+                right=lefts.get(one.right),
+                stop_line=stop_line,
+                stop_sign=stop_sign,
+            )
 
 
 def _extended(joined: list[str], parts: list[list[str]]) -> list[str]:
@@ -351,27 +346,6 @@ def _extended(joined: list[str], parts: list[list[str]]) -> list[str]:
     return []
 
 
-def line_of(world: OsmMap, nodes: tuple[str, ...]) -> np.ndarray:
-    """Positions [n, 2] m of nodes."""
-    return np.array([world.points[node] for node in nodes])
-
-
-def _rules(world: OsmMap, relation: Element) -> list[Rule]:
-    """Regulatory elements that a lanelet refers to, each once."""
-    names = dict.fromkeys(
-        member.get("ref", "")
-        for member in relation.iterfind("member")
-        if member.get("type") == "relation"
-    )
-    return [world.rules[name] for name in names if name in world.rules]
-
-
-def speed_limit(world: OsmMap, relation: Element) -> float | None:
-    """Returns the limit [m/s] of the last rule, or of the lanelet's own tag."""
-    limits = [rule.limit for rule in _rules(world, relation) if rule.limit is not None]
-    return limits[-1] if limits else _first_speed([tag_of(relation, "speed_limit")])
-
-
 def _first_speed(texts: list[str]) -> float | None:
     for text in texts:
         # one place for spaces: several take a time that is the square of their number
@@ -383,27 +357,26 @@ def _first_speed(texts: list[str]) -> float | None:
     return None
 
 
-def stop_of(
-    world: OsmMap, name: str, relation: Element, ends: np.ndarray
+def _stop_of(
+    rules: list[_Rule], name: str, ends: np.ndarray
 ) -> tuple[np.ndarray | None, bool]:
-    """Returns end points [2, 2] m of the stop line; whether everybody has to stop.
+    """End points [2, 2] m of a lanelet's stop line; whether everybody has to stop.
 
     A rule without a line of its own stops traffic at the lanelet's end.
     """
     found, sign = [], False
-    for rule in _rules(world, relation):
+    for rule in rules:
         concerned = {
             "traffic_light": True,
             "all_way_stop": True,
             "traffic_sign": rule.stops,
             "right_of_way": name in rule.yields,
         }
-        if not concerned.get(rule.subtype, False):
-            continue
-        sign = sign or rule.stops
-        found.append(rule.lines)
-        if not len(rule.lines) and (rule.subtype == "traffic_light" or rule.stops):
-            found.append(ends[None])
+        if concerned.get(rule.subtype, False):
+            sign = sign or rule.stops
+            found.append(rule.lines)
+            if not len(rule.lines) and (rule.subtype == "traffic_light" or rule.stops):
+                found.append(ends[None])
     lines = np.concatenate([*found, np.zeros((0, 2, 2))])
     if not len(lines):
         return None, False
