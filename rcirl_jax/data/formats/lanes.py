@@ -28,6 +28,7 @@ MAX_PATHS = 200  # longest tracks tried as lanes
 MOVING_MPS = 0.5  # m/s; below it positions only jitter
 MIN_POINTS = 3  # points of the shortest lane
 MIN_ALIGNED = 0.7  # cosine of the largest angle between a path and its lane
+SIDES = ("left", "right")
 COLUMNS = {"id": "text", "x": "number", "y": "number"}  # of a table of lanes
 OPTIONAL = {
     **{"width": "number", "speed_limit": "number"},
@@ -92,12 +93,11 @@ def _lanes_of_file(path: Path, name: str) -> list[dict]:
 def _given_lane(
     path: Path, lane: dict, usual: float, metres: Callable[[np.ndarray], np.ndarray]
 ) -> Lane:
-    name = str(lane.get("id", "(no id)"))
+    name, limit = str(lane.get("id", "(no id)")), lane.get("speed_limit")
     where = f"{path}: lanes {name}"
     try:
         points = np.array(lane.get("points", []), np.float64)
         width = np.array(lane.get("width", np.nan), np.float64)
-        limit = lane.get("speed_limit")
         limit = None if limit is None else float(limit)
     except (ValueError, TypeError) as error:
         raise InputError(f"{where}: {error}: expected numbers") from error
@@ -108,16 +108,16 @@ def _given_lane(
     if width.shape not in ((), (len(points),)):
         raise InputError(f"{where}: width: {width.shape}: expected one, or one a point")
     half = np.zeros(len(points)) + 0.5 * np.where(np.isnan(width), usual, width)
-    left, right = lane.get("left"), lane.get("right")
+    left, right = (None if one is None else str(one) for one in map(lane.get, SIDES))
     return Lane(
         id=name,
         centre=metres(points),
         left_width=half,
         right_width=half.copy(),
         speed_limit=limit,
-        successors=tuple(str(s) for s in lane.get("successors", [])),
-        left=None if left is None else str(left),
-        right=None if right is None else str(right),
+        successors=tuple(map(str, lane.get("successors", []))),
+        left=left,
+        right=right,
         width_assumed=bool(np.isnan(width).any()),
     )
 
@@ -162,18 +162,16 @@ def straight_lanes(
         above, below = beside(lane, +1.0), beside(lane, -1.0)
         up = 0.5 * width if above is None else 0.5 * (above.y - lane.y)
         down = 0.5 * width if below is None else 0.5 * (lane.y - below.y)
-        left, right = (above, below) if lane.forward else (below, above)
-        sides = (up, down) if lane.forward else (down, up)
-        ids = [None if other is None else other.id for other in (left, right)]
-        made = parallel_lane(lane, sides, ids, limit)
-        is_guessed = above is None or below is None
-        lanes.append(dataclasses.replace(made, width_assumed=is_guessed))
+        ids = [None if other is None else other.id for other in (above, below)]
+        turn = slice(None, None, 1 if lane.forward else -1)  # left before right
+        made = parallel_lane(lane, (up, down)[turn], ids[turn], limit)
+        lanes.append(dataclasses.replace(made, width_assumed=None in ids))
     return tuple(lanes)
 
 
 def parallel_lane(
     lane: StraightLane,
-    sides: tuple[float, float],
+    sides: Sequence[float],
     beside: Sequence[str | None],
     limit: float | None,
 ) -> Lane:
@@ -210,13 +208,27 @@ def path_lanes(
       limit: m/s, or None.
     """
     vehicles = [track for track in tracks if track.kind == Kind.VEHICLE]
-    length = {id(t): np.hypot(np.ptp(t.x), np.ptp(t.y)) for t in vehicles}
-    fitted = _Fitted(width, limit)
-    for track in sorted(vehicles, key=lambda t: -length[id(t)])[:MAX_PATHS]:
+    vehicles.sort(key=lambda track: -np.hypot(np.ptp(track.x), np.ptp(track.y)))
+    fitted = _Fitted(width)
+    for track in vehicles[:MAX_PATHS]:
         points = _thin(track)
         if len(points) >= MIN_POINTS:
             fitted.add(points)
-    return tuple(fitted.lanes)
+    lanes = []
+    for place, line in enumerate(fitted.lines):
+        half = np.full(len(line), 0.5 * width)
+        after = [fitted.after[place]] if place in fitted.after else []
+        lane = Lane(
+            id=f"path-{place}",
+            centre=line,
+            left_width=half,
+            right_width=half,
+            speed_limit=limit,
+            width_assumed=True,
+            successors=tuple(f"path-{other}" for other in after),
+        )
+        lanes.append(lane)
+    return tuple(lanes)
 
 
 def _thin(track: Track) -> np.ndarray:
@@ -247,11 +259,12 @@ def _ways(points: np.ndarray) -> np.ndarray:
 
 
 class _Fitted:
-    """Lanes so far: their points with directions, and where each starts."""
+    """Centre lines so far, in order; their points with directions; which follows."""
 
-    def __init__(self, width: float, limit: float | None) -> None:
-        self.width, self.limit = width, limit
-        self.lanes: list[Lane] = []
+    def __init__(self, width: float) -> None:
+        self.width = width
+        self.lines: list[np.ndarray] = []
+        self.after: dict[int, int] = {}  # number of a line -> of the next one
         self.points, self.ways = np.zeros((0, 2)), np.zeros((0, 2))
 
     def add(self, points: np.ndarray) -> None:
@@ -273,7 +286,7 @@ class _Fitted:
             if known.any(axis=1).mean() > 0.5:
                 first, before = last - 1, -1
                 continue
-            starts = np.cumsum([0, *(len(lane.centre) for lane in self.lanes)])[:-1]
+            starts = np.cumsum([0, *map(len, self.lines)])[:-1]
             met = known[:, starts]
             met[:MIN_POINTS] = False
             rows, meets = np.flatnonzero(met.any(axis=1)), -1
@@ -281,30 +294,15 @@ class _Fitted:
                 last = first + int(rows[0])
                 meets = int(np.flatnonzero(met[rows[0]])[0])
             line = points[first:last]
+            number = len(self.lines)
+            if before >= 0:
+                self.after[before] = number
             if meets >= 0:
-                line = np.concatenate([line, self.lanes[meets].centre[:1]])
-            number = len(self.lanes)
-            self._append(line, before, meets)
+                line = np.concatenate([line, self.lines[meets][:1]])
+                self.after[number] = meets
+            self.lines.append(line)
+            self.points = np.concatenate([self.points, line])
+            self.ways = np.concatenate([self.ways, _ways(line)])
             first, before = last - 1, -1 if meets >= 0 else number
             if last == len(points):
                 break
-
-    def _append(self, line: np.ndarray, before: int, after: int) -> None:
-        """Adds a lane; links it to the one before and to the one it leads into."""
-        half = np.full(len(line), 0.5 * self.width)
-        self.points = np.concatenate([self.points, line])
-        self.ways = np.concatenate([self.ways, _ways(line)])
-        made = Lane(
-            id=f"path-{len(self.lanes)}",
-            centre=line,
-            left_width=half,
-            right_width=half,
-            speed_limit=self.limit,
-            width_assumed=True,
-            successors=() if after < 0 else (f"path-{after}",),
-        )
-        if before >= 0:
-            self.lanes[before] = dataclasses.replace(
-                self.lanes[before], successors=(made.id,)
-            )
-        self.lanes.append(made)

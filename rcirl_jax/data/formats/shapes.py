@@ -85,21 +85,16 @@ def moves(points: np.ndarray) -> np.ndarray:
     return np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])
 
 
-def between_bounds(
-    left: np.ndarray, right: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns centre line [m, 2] and half width [m] of a lane between two polylines.
+def facing(left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns points [m, 2] of both bounds of a lane at equal shares of their lengths.
 
-    Both bounds run in driving direction; points at equal fractions of their
-    lengths face each other.
+    Both run in driving direction. Points between which the middle stands still are one.
     """
     at = np.concatenate([fractions(left), fractions(right)])
     at = np.unique(np.round(at, FRACTION_DIGITS))
     left, right = resample(left, at), resample(right, at)
-    centre = 0.5 * (left + right)
-    half = np.maximum(0.5 * np.hypot(*(left - right).T), MIN_HALF_WIDTH_M)
-    keep = moves(centre)
-    return centre[keep], half[keep]
+    keep = moves(left + right)
+    return left[keep], right[keep]
 
 
 def lane_between(

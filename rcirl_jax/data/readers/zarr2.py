@@ -68,12 +68,12 @@ class StructuredArray:
         (self.size,), (self.chunk,) = meta.shape, meta.chunks
         self.dtype = _dtype(file, meta.dtype)
         for name, (kinds, shape) in fields.items():
-            if name not in (self.dtype.names or ()):
+            names = self.dtype.names or ()
+            found = self.dtype[name] if name in names else None
+            if found is None:
                 raise InputError(
-                    f"{file}: dtype: {name}: missing: expected it among "
-                    f"{self.dtype.names}"
+                    f"{file}: dtype: {name}: missing: expected it among {names}"
                 )
-            found = self.dtype[name]
             if found.base.kind not in kinds or found.shape != shape:
                 raise InputError(
                     f"{file}: dtype: {name}: {found}: expected shape {shape}, "
@@ -104,7 +104,7 @@ class StructuredArray:
             raw = self._store[start:stop].read().result()
         except ValueError as error:
             raise InputError(
-                f"{self.path}: {where}: {_brief(error)}: expected whole chunks"
+                f"{self.path}: {where}: {str(error)[:120]}: expected whole chunks"
             ) from error
         records = np.ascontiguousarray(raw).reshape(-1).view(self.dtype)
         for name in self._texts:
@@ -142,7 +142,6 @@ class StructuredArray:
     def _check_chunk(self, number: int) -> None:
         """Checks that a chunk is there (a missing one reads as 0) and its two sizes."""
         file = self.path / str(number)
-        expected = self.chunk * self.dtype.itemsize
         try:
             size = file.stat().st_size
             with file.open("rb") as handle:
@@ -151,44 +150,34 @@ class StructuredArray:
             raise InputError(
                 f"{file}: chunk: {error.strerror}: expected a file"
             ) from error
+        expected = self.chunk * self.dtype.itemsize
         if self._is_packed:
-            if len(head) < BLOSC_HEADER:
-                raise InputError(f"{file}: chunk: {size} bytes: expected blosc data")
-            found = int.from_bytes(head[4:8], "little")
-            if found != expected:
+            unpacked, packed = (int.from_bytes(head[k:][:4], "little") for k in (4, 12))
+            if unpacked != expected:
                 raise InputError(
-                    f"{file}: chunk: {found} bytes decompressed: expected {expected}"
+                    f"{file}: chunk: {unpacked} bytes decompressed: expected {expected}"
                 )
-            expected = int.from_bytes(head[12:16], "little")
+            expected = packed
         if size != expected:
             raise InputError(f"{file}: chunk: {size} bytes: expected {expected}")
         self._checked.add(number)
 
 
-def _brief(error: Exception) -> str:
-    """First line of a message, short."""
-    return (str(error).splitlines() or [type(error).__name__])[0][:120]
-
-
 def _dtype(file: Path, fields: list[list]) -> np.dtype:
     """The type of a record, by its fields [name, type] or [name, type, shape]."""
     parts = []
-    for field in fields:
-        name, kind, *shape = field
-        is_shape = all(isinstance(part, list) for part in shape)
-        match = TYPE.fullmatch(kind) if isinstance(kind, str) else None
-        if not (isinstance(name, str) and name and match and is_shape):
+    for name, kind, *shape in fields:
+        match = TYPE.fullmatch(str(kind))
+        if not (isinstance(name, str) and match and {*map(type, shape)} <= {list}):
             raise InputError(
-                f"{file}: dtype: {str(field)[:60]}: "
+                f"{file}: dtype: {str([name, kind, *shape])[:60]}: "
                 "expected [name, little-endian number or text, shape]"
             )
         parts.append((name, f"<{match[1]}", *map(tuple, shape)))
     try:
         dtype = np.dtype(parts)
     except ValueError as error:
-        raise InputError(
-            f"{file}: dtype: {_brief(error)}: expected different names"
-        ) from error
+        raise InputError(f"{file}: dtype: {error}: expected different names") from error
     if not 0 < dtype.itemsize <= MAX_RECORD_BYTES:
         raise InputError(
             f"{file}: dtype: {dtype.itemsize} bytes: expected 1 to {MAX_RECORD_BYTES}"

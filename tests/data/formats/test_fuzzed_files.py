@@ -60,28 +60,26 @@ def head(shape, kind="<f8"):
 
 def test_pickles_in_a_suite_are_not_loaded(members, tmp_path):
     file, content = members
-    target = tmp_path / "executed"
-    objects = npy(np.array([Bomb(target)], dtype=object), allow_pickle=True)
-    for data in (
-        *(archive_of({**content, "ids.npy": objects}), objects),
-        pickle.dumps(Bomb(target)),
-    ):
+    bomb = Bomb(tmp_path / "executed")
+    objects = npy(np.array([bomb], dtype=object), allow_pickle=True)
+    with_bomb = archive_of({**content, "ids.npy": objects})
+    for data in (with_bomb, objects, pickle.dumps(bomb)):
         file.write_bytes(data)
         assert str(file) in refused(read_runs, file)
-    assert not target.exists()
+    assert not (tmp_path / "executed").exists()
 
 
 def texts(order, point):
     return npy(np.array([point, 65], f"{order}u4").view(f"{order}U1"))
 
 
+SIZES, METRICS = (
+    "of float64 in 64 bytes: expected the",
+    "expected the metrics of a suite",
+)
 NOTHING, BAD_TEXT = "(1099511627776, 0, 0), not", "ids: characters that are none"
-METRICS = "expected the metrics of a suite"
 BAD_MEMBERS = [
-    *[
-        ("way", head(shape) + bytes(64), "of float64 in 64 bytes: expected the")
-        for shape in ((2**62,), (10**30,), (-1,))
-    ],
+    *[("way", head(n) + bytes(64), SIZES) for n in ((2**62,), (10**30,), (-1,))],
     # texts of no length take no room in the file, and as Python's some gigabytes
     ("names", head((10**6,), "<U0"), "names: 1000000 values in 0 bytes"),
     # a list of many times nothing would take terabytes
@@ -89,13 +87,10 @@ BAD_MEMBERS = [
     *[("way", head(2, kind), METRICS) for kind in ("(,)f8", "f8,(", "f9", "")],
     *[("ids", texts("<", point), BAD_TEXT) for point in (0x110000, 0xD800)],
     ("ids", texts(">", 2**32 - 1), BAD_TEXT),
-    *[
-        (name, npy(np.array(values)), METRICS)
-        for name, values in (
-            *[("way", ["far", "near"]), ("names", ["ours", "ours"])],
-            *[("groups", [1, 2]), ("row0.inside", np.ones((2, 5)))],
-        )
-    ],
+    ("way", npy(np.array(["far", "near"])), METRICS),
+    ("names", npy(np.array(["ours", "ours"])), METRICS),
+    ("groups", npy(np.array([1, 2])), METRICS),
+    ("row0.inside", npy(np.ones((2, 5))), METRICS),
     ("row0.start_time", None, METRICS),
 ]
 
@@ -134,20 +129,20 @@ def test_a_suite_that_unpacks_to_gigabytes_is_refused(members, monkeypatch):
 # ------------------------------------------------------------------- TOML and XML
 
 
-NESTED = [
-    *[
-        "a = " + begin * count + inner + end * count
-        for begin, inner, end in (("[", "", "]"), ("{a=", "1", "}"))
-        for count in (110, 1000)
-    ],
-    "a = " + "[" * DEEP + "]" * DEEP,
-]
+def toml(folder, text):
+    """The line that refuses a TOML."""
+    (folder / "x.toml").write_text(text)
+    return refused(load_toml, folder / "x.toml")
 
 
-@pytest.mark.parametrize("text", NESTED)
-def test_deep_nesting_is_one_line(tmp_path, text):
-    (tmp_path / "deep.toml").write_text(text)
-    assert "nested too deeply" in refused(load_toml, tmp_path / "deep.toml")
+LISTS, TABLES = ("[", "", "]"), ("{a=", "1", "}")
+NESTED = [(way, count) for way in (LISTS, TABLES) for count in (110, 1000)]
+
+
+@pytest.mark.parametrize(("way", "count"), [*NESTED, (LISTS, DEEP)])
+def test_deep_nesting_is_one_line(tmp_path, way, count):
+    text = "a = " + way[0] * count + way[1] + way[2] * count
+    assert "nested too deeply" in toml(tmp_path, text)
 
 
 KEYS = [
@@ -161,13 +156,14 @@ KEYS = [
 
 
 @pytest.mark.parametrize("text", KEYS)
-@pytest.mark.parametrize("joined", [".", " .\t"])
-@pytest.mark.parametrize("part", ["a", '"a.b"', "''"])
+@pytest.mark.parametrize(
+    ("joined", "part"), [(".", "a"), (" .\t", '"a.b"'), (".", "''")]
+)
 def test_keys_of_many_parts(tmp_path, text, joined, part):
     """The parser takes minutes for some thousands of them."""
+    line = toml(tmp_path, text.format(key=joined.join([part] * 33)))
+    assert re.search("x.toml: line [123]: .*32 parts", line)
     file = tmp_path / "x.toml"
-    file.write_text(text.format(key=joined.join([part] * 33)))
-    assert re.search("x.toml: line [123]: .*32 parts", refused(load_toml, file))
     file.write_text(text.format(key=joined.join([part] * 32)))
     assert load_toml(file)
 
@@ -176,24 +172,21 @@ def test_dots_that_are_no_key(tmp_path):
     some = ["a." * 40, "..." * 40, "it's a.b"]
     lines = [f'x{k} = "{text}" # {text}' for k, text in enumerate(some)]
     lines += [f'y{k} = """\n{text}\n"""' for k, text in enumerate(some)]
-    lines += ["z = [" + "1.5," * 40 + "]"]
     file = tmp_path / "x.toml"
-    file.write_text("\n".join(lines))
+    file.write_text("\n".join([*lines, "z = [" + "1.5," * 40 + "]"]))
     assert len(load_toml(file)) == 7
 
 
 def test_long_numbers_and_files_in_a_toml(tmp_path, monkeypatch):
-    file = tmp_path / "x.toml"
-    file.write_text("a = " + "9" * 5000)
-    assert "x.toml: " in refused(load_toml, file)
+    assert "x.toml: " in toml(tmp_path, "a = " + "9" * 5000)
     for number in ("0x" + "f" * 4000, "9" * 4000, "-9223372036854775809"):
-        file.write_text(f"[b]\na = [{{c = {number}}}]")
-        line = refused(load_toml, file)
+        line = toml(tmp_path, f"[b]\na = [{{c = {number}}}]")
         assert re.search(r"b.a.c: a number of \d+ bits: expected at most 63", line)
-    file.write_text("a = [-9223372036854775808, 0x7fffffffffffffff]")
-    assert load_toml(file)["a"] == [-(2**63), 2**63 - 1]
+    text = "a = [-9223372036854775808, 0x7fffffffffffffff]"
+    (tmp_path / "x.toml").write_text(text)
+    assert load_toml(tmp_path / "x.toml")["a"] == [-(2**63), 2**63 - 1]
     monkeypatch.setattr("rcirl_jax.runtime.specs.MAX_BYTES", 10)
-    assert "size: expected at most" in refused(load_toml, file)
+    assert "size: expected at most" in toml(tmp_path, text)
 
 
 def test_deep_xml_is_read_or_one_line(tmp_path):
@@ -206,44 +199,31 @@ REPEATED = '<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">'
 OUTSIDE = 'SYSTEM "file:///etc/hostname"'
 
 
-@pytest.mark.parametrize("name", ["commonRoad", "osm"])
 @pytest.mark.parametrize("dtd", [f"[{REPEATED}]", f"[<!ENTITY x {OUTSIDE}>]", OUTSIDE])
-def test_xml_of_entities_or_references_is_refused(tmp_path, name, dtd):
+def test_xml_of_entities_or_references_is_refused(tmp_path, dtd):
     file = tmp_path / "x.xml"
-    file.write_text(f"<!DOCTYPE b {dtd}><{name}/>")
-    line = refused(read_xml, file, name, 10_000)
+    file.write_text(f"<!DOCTYPE b {dtd}><osm/>")
+    line = refused(read_xml, file, "osm", 10_000)
     assert line.endswith("expected no DTD, entities or external references")
-    file.write_text(f"<{name}/>")
-    assert "size: " in refused(read_xml, file, name, 3)
+    assert "size: " in refused(read_xml, file, "osm", 3)
 
 
 # ----------------------------------------------------------------------- options
 
 
-HEX = "0x" + "f" * 4000
+HEX, BAD = "0x" + "f" * 4000, ("../*.csv", "/etc/*", "", "a**", "**/**/x.csv")
+SAME_COLUMN = 'columns = {t = "t", id = "id", x = "id", y = "y"}'
 BAD_OPTIONS = [
-    *[
-        (f'pattern = "{bad}"', f"pattern: {bad}: expected file names")
-        for bad in ("../*.csv", "/etc/*", "", "a**", "**/**/x.csv")
-    ],
+    *[(f'pattern = "{bad}"', f"pattern: {bad}: expected file names") for bad in BAD],
     (f'pattern = "{"x" * 300}"', "expected file names"),
     (f'pattern = "{"x/" * 600}x"', "/x: expected file names"),
-    ("rate_hz = [1]", "rate_hz: [1]: expected a number"),
-    ('long_bytes = "256MB"', "long_bytes: 256MB: expected a number"),
     ("max_bad_rows = 1.0", "max_bad_rows: 1: expected a share from 0 to below 1"),
     ("max_bad_rows = -0.1", "max_bad_rows: -0.1: expected a share"),
-    ("max_bad_rows = true", "max_bad_rows: True: expected"),
     ("rate_hz = 5" + "0" * 18, "expected at most 1e+18"),
     (f"rate_hz = {HEX}", "rate_hz: a number of 16000 bits: expected at most 63"),
-    ("units = 'm'", "units: m: expected a table"),
-    ("columns = {t = 3}", "columns.t: 3: expected a text"),
     ("lanes = [3]", "lanes: [3]: expected tables"),
-    ("defaults = 3", "defaults: 3: expected a table"),
     ("speed_limit = 1" + "0" * 400, "bits: expected at most 63"),
-    (
-        'columns = {t = "t", id = "id", x = "id", y = "y"}',
-        "columns.x: id: expected a column of numbers",
-    ),
+    (SAME_COLUMN, "columns.x: id: expected a column of numbers"),
     ('lanes = {file = "a\\u0000b"}', "file: a?b: expected a path"),
     (f'lanes = {{file = "{"a/" * 3000}x"}}', "a path of 6001 bytes: expected"),
 ]
@@ -280,13 +260,11 @@ def test_row_groups_that_claim_too_much(tmp_path, monkeypatch, name, words):
 
 def test_a_database_whose_errors_are_no_text(tmp_path):
     file = tmp_path / "x.db"
-    with sqlite3.connect(file) as made:
-        made.execute("CREATE TABLE first (a)")
-        made.execute("CREATE TABLE other (b)")
+    made = sqlite3.connect(file)
+    made.executescript("CREATE TABLE first (a); CREATE TABLE other (b)")
     made.close()
-    file.write_bytes(
-        file.read_bytes().replace(b"TABLE other (b)", b"TABLE\x88" * 2 + b"\x88" * 3)
-    )
+    broken = b"TABLE\x88" * 2 + b"\x88" * 3
+    file.write_bytes(file.read_bytes().replace(b"TABLE other (b)", broken))
     with Database(file) as database:
         assert "x.db: database: " in refused(database.columns, "first")
 
@@ -333,22 +311,22 @@ def test_a_map_whose_path_is_too_long(find, tmp_path):
 
 
 def test_clocks_that_stand_still_or_would_fill_the_memory(tmp_path):
-    source = tmp_path / "source.toml"
-
-    def line_of(form, place, text):
-        source.write_text(text)
-        return refused(read, form, place, source)
-
-    log = writers.ngsim_csv(tmp_path / "log.csv", writers.ngsim_rows())
-    assert "frame_s: 0: expected > 0" in line_of("ngsim", log, "frame_s = 0")
-    rows = "".join(f"{k * 1e-5:.5f},a,{k * 1e-2:.4f},0\n" for k in range(200))
-    log.write_text(f"t,id,x,y\n{rows}")
+    log, source = tmp_path / "log.csv", tmp_path / "source.toml"
+    writers.ngsim_csv(log, writers.ngsim_rows())
     columns = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y"))
-    line = line_of("csv", log, f"rate_hz = 1e5\n[columns]\n{columns}\n")
-    assert "rate_hz: 100000: expected up to 1000" in line
-    source.write_text("rate_hz = 1" + "0" * 400)
-    line = refused(read, "synthetic", source)
-    assert "rate_hz: a number of 1329 bits: expected at most 63" in line
+    rows = "".join(f"{k * 1e-5:.5f},a,{k * 1e-2:.4f},0\n" for k in range(200))
+    bits = "rate_hz: a number of 1329 bits: expected at most 63"
+    fast = f"rate_hz = 1e5\n[columns]\n{columns}\n"
+    for form, place, text, words in (
+        ("ngsim", log, "frame_s = 0", "frame_s: 0: expected > 0"),
+        ("csv", log, fast, "rate_hz: 100000: expected up to 1000"),
+        ("synthetic", source, "rate_hz = 1" + "0" * 400, bits),
+    ):
+        source.write_text(text)
+        if form == "csv":
+            log.write_text(f"t,id,x,y\n{rows}")
+        given = () if place == source else (source,)
+        assert words in refused(read, form, place, *given)
 
 
 def test_digests_of_a_checkpoint_that_are_no_table(tmp_path):

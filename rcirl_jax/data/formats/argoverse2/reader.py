@@ -40,8 +40,9 @@ from rcirl_jax.data.formats.perception import (
     without_outliers,
 )
 from rcirl_jax.data.formats.shapes import (
-    between_bounds,
     check_coordinates,
+    facing,
+    lane_between,
     local_origin,
     origin_notes,
 )
@@ -54,7 +55,7 @@ from rcirl_jax.runtime.atomic_files import read_json
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.types import Lane, Recording, Track
 
-COLUMNS = dict.fromkeys(
+COLUMNS: dict[str, str] = dict.fromkeys(
     (
         *("object_category", "timestep", "position_x", "position_y", "heading"),
         *("velocity_x", "velocity_y", "start_timestamp", "end_timestamp"),
@@ -311,12 +312,9 @@ def _lane(path: Path, segment: _Segment, origin: np.ndarray) -> Lane:
         where = f"lane segment {segment.id}: {side}"
         check_coordinates(path, where, ("x", "y"), points)
         bounds.append(points - origin)
-    centre, half = between_bounds(*bounds)
-    return Lane(
-        id=str(segment.id),
-        centre=centre,
-        left_width=half,
-        right_width=half,
+    return lane_between(
+        str(segment.id),
+        facing(*bounds),
         speed_limit=None,
         successors=tuple(map(str, segment.successors)),
         left=str(segment.left_neighbor_id),  # "None" is no lane's

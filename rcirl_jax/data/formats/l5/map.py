@@ -16,8 +16,9 @@ from rcirl_jax.data.formats.perception import STATES, held_states, signal_of
 from rcirl_jax.data.formats.projection import earth_centred
 from rcirl_jax.data.formats.shapes import (
     Roads,
-    between_bounds,
     check_coordinates,
+    facing,
+    lane_between,
     limit_of,
     moves,
 )
@@ -190,14 +191,14 @@ class SemanticMap:
         left, right = (self._bound(name, b, frame) for b in (lane.left, lane.right))
         if min(len(left), len(right)) < 2:
             return None
-        centre, half = between_bounds(left, right)
-        if len(centre) < 2:
+        bounds = facing(left, right)
+        if len(bounds[0]) < 2:
             return None
         # bounds may run against the traffic: then the left one lies to the right
-        along, across = centre[1] - centre[0], left[0] - right[0]
-        if along[0] * across[1] - along[1] * across[0] < 0.0:
+        (x, y), across = np.diff(bounds[0] + bounds[1], axis=0)[0], left[0] - right[0]
+        if x * across[1] - y * across[0] < 0.0:
             left, right = left[::-1], right[::-1]
-            centre, half = centre[::-1], half[::-1]
+            bounds = bounds[0][::-1], bounds[1][::-1]
         parent = lane.parent.id
         forward, back = self._limits.get(parent, (0.0, 0.0))
         limit = back if lane.direction == BACKWARD and back > 0.0 else forward
@@ -213,11 +214,9 @@ class SemanticMap:
         # who is inside a junction was held at its edge: a parent that is no segment
         at = 0 if parent and parent not in self._limits else -1
         stops = np.stack([left[at], right[at]]) if governing or stop_sign else None
-        return Lane(
-            id=name,
-            centre=centre,
-            left_width=half,
-            right_width=half,
+        return lane_between(
+            name,
+            bounds,
             speed_limit=limit_of(limit),
             successors=tuple(other.id for other in lane.ahead),
             left=lane.beside_left.id or None,
