@@ -110,16 +110,6 @@ def test_steps_after_a_damaged_one_are_saved_again(folder, state):
         assert restored(folder, state) == (4, [])
 
 
-def test_two_damaged_ones_are_two_lines(folder, state):
-    (folder / "4" / "position" / "metadata").unlink()
-    (folder / "3" / DIGESTS).unlink()
-    step, lines = restored(folder, state)
-    assert step == 2
-    assert [line.partition("checkpoint ")[2].partition(";")[0] for line in lines] == [
-        "4: position/metadata: missing", f"3: {DIGESTS}: damaged or missing",
-    ]  # fmt: skip
-
-
 def test_no_whole_one_is_one_line_and_nothing_is_touched(folder):
     for step in "234":
         (folder / step / "state" / "manifest.ocdbt").write_bytes(b"")

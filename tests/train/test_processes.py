@@ -107,13 +107,6 @@ def test_many_devices_equal_one(undisturbed, name):
     assert_equals_one_device(undisturbed, *undisturbed[name])
 
 
-@pytest.mark.slow
-def test_four_processes_of_devices_equal_one(data, undisturbed, tmp_path):
-    seen = finished(start(data, tmp_path, "shard_map", 4, 1), tmp_path)
-    assert len(seen) == 4
-    assert_equals_one_device(undisturbed, tmp_path, seen)
-
-
 def assert_equals_one_device(undisturbed, folder, seen):
     """A run of four devices, by what its processes saw."""
     one, (single,) = undisturbed["1x1"]

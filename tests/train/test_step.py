@@ -23,13 +23,11 @@ from rcirl_jax.train.featurise import (
     featurised,
     host_batch,
     info_of,
-    log_density,
     not_finite,
 )
 from rcirl_jax.train.parallel import parallelise
 from rcirl_jax.train.state import OPTIMIZERS, TrainConfig, make_optimizer
 from rcirl_jax.train.step import (
-    gradient_sums,
     init_state,
     make_train_step,
     unusable_scenes,
@@ -146,26 +144,6 @@ def test_scene_by_scene_and_block_by_block_is_the_step_of_the_whole(monkeypatch)
     assert not step(state, scenes.replace(demonstrations=made))[1].finite
 
 
-def test_a_feature_that_is_the_same_everywhere_gets_no_gradient():
-    """Not even from round-off: Adam would make a whole step of it."""
-    made = cached()
-    candidates = made.candidates.at[:, 3].set(17.3)
-    human = made.human.at[:, :, 3].set(17.3)
-    made = made.replace(candidates=candidates, human=human)
-    same = normaliser().replace(
-        lower=normaliser().lower.at[3].set(0.0),
-        upper=normaliser().upper.at[3].set(30.0),
-        location=normaliser().location.at[3].set(17.3),
-        scale=normaliser().scale.at[3].set(1e-3),
-    )
-    state = init_state(CONFIG, same)
-    slopes = lambda p: gradient_sums(state.apply_fn, p, same, made, CONFIG)  # noqa: E731
-    grads, _ = jax.jit(slopes)(state.params)
-    slope = np.abs(grads["point"]["hidden_0"]["kernel"])
-    assert slope[3].max() == 0.0
-    assert slope.max() > 0.0
-
-
 @pytest.mark.parametrize(
     ("value", "weight", "found"),
     [(np.inf, 1.0, True), (-np.inf, 1.0, True), (np.nan, 1.0, True),
@@ -249,9 +227,8 @@ def human_is_better():
 
 
 @pytest.mark.parametrize("loss", sorted(LOSSES))
-@pytest.mark.parametrize("optimizer", ["sgd", "adam", "rmsprop"])
-def test_learns_a_direction(loss, optimizer):
-    config = dataclasses.replace(CONFIG, loss=loss, optimizer=optimizer)
+def test_learns_a_direction(loss):
+    config = dataclasses.replace(CONFIG, loss=loss)
     step, state = jax.jit(make_train_step(config)), init_state(config, normaliser())
     made = human_is_better()
     for _ in range(60):
@@ -356,12 +333,12 @@ def test_decay_pulls_kernels_and_biases_only(how):
 
 @pytest.mark.parametrize("name", OPTIMIZERS)
 def test_any_optimiser_of_optax_takes_steps(name):
-    """With a rate of its own, which may be an array as that of a sweep's members."""
-    config = TrainConfig(optimizer=name, learning_rate=0.01, halve_every=10**9)
+    """With a rate of its own, which is an array as that of a sweep's members."""
+    config = TrainConfig(optimizer=name, learning_rate=0.5, halve_every=10**9)
     first = {"gamma": jnp.array([1.0, -2.0]), "kernel": jnp.ones((2, 3))}
     slope = {"gamma": jnp.array([0.3, 0.1]), "kernel": jnp.full((2, 3), -0.2)}
 
-    def steps(rule, rate=None):
+    def stepped(rule, rate=None):
         params, state = first, rule.init(first)
         if rate is not None:
             state = optax.tree.set(state, learning_rate=rate)
@@ -370,15 +347,10 @@ def test_any_optimiser_of_optax_takes_steps(name):
             params = optax.apply_updates(params, updates)
         return params
 
-    other = make_optimizer(dataclasses.replace(config, learning_rate=0.5))
-    by_array = jax.jit(lambda rate: steps(other, rate))(jnp.float32(0.01))
-    fixed = jax.jit(lambda: steps(make_optimizer(config)))()
-    plain = jax.jit(lambda: steps(OPTIMIZERS[name](0.01)))()
-    for a, b, c, old in zip(
-        *map(jax.tree.leaves, (by_array, fixed, plain, first)), strict=True
-    ):
+    found = jax.jit(lambda rate: stepped(make_optimizer(config), rate))(0.01)
+    plain = jax.jit(lambda: stepped(OPTIMIZERS[name](0.01)))()
+    for a, b, old in zip(*map(jax.tree.leaves, (found, plain, first)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6)
-        np.testing.assert_allclose(a, c, rtol=1e-6)
         assert np.isfinite(a).all()
         assert (a != old).all()
 
@@ -390,14 +362,6 @@ def test_the_gradient_is_cut_down_to_its_norm():
         rule = make_optimizer(config)
         updates, _ = rule.update(slope, rule.init(slope), slope)
         assert float(optax.tree.norm(updates)) == pytest.approx(want, rel=1e-5)
-
-
-def test_twins_count_as_often_as_they_are_drawn():
-    """Candidates at 0, 0 and 100 m: the twins have twice the density of the third."""
-    place = jnp.array([0.0, 0.0, 100.0])
-    squared = (place[:, None] - place) ** 2
-    found = log_density(squared, ~jnp.eye(3, dtype=bool))
-    np.testing.assert_allclose(np.exp(found), [2.0, 2.0, 1.0], rtol=1e-6)
 
 
 def test_densities_are_those_of_a_gaussian_kernel_pair_by_pair():
