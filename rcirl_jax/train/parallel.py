@@ -6,7 +6,9 @@ of devices, which are those of all processes together. A process holds its
 contiguous part of the batch; `place` makes one global batch of the parts.
 
 "shard_map" is `jit` over arrays with a NamedSharding, where every device scans over
-its own scenes; it is what "auto" takes on several devices. On a CPU wait for every step
+its own scenes; it is what "auto" takes on several devices. Without it `jit` gives every
+device all scenes of the scan, which takes twice as long on two CPU devices; under
+`jax.vmap` over the shards it takes 8 % longer. On a CPU wait for every step
 before the next (the loop does): its devices share one pool of threads, and steps that
 run ahead may wait for each other's sums for ever.
 """

@@ -84,10 +84,14 @@ def oracle(name, c):
 @pytest.mark.parametrize("name", sorted(LOSSES))
 @pytest.mark.parametrize("seed", [0, 1])
 def test_equals_its_definition(name, seed):
-    sums = loss_sums(name, drawn(seed), CONFIG)
-    assert float(sums.loss / sums.terms) == pytest.approx(
-        oracle(name, drawn(seed)), rel=1e-5
-    )
+    c = drawn(seed)
+    sums = loss_sums(name, c, CONFIG)
+    assert float(sums.loss / sums.terms) == pytest.approx(oracle(name, c), rel=1e-5)
+    counts = [(b, k) for b in np.flatnonzero(c.weight) for k in range(K)]
+    counts = [at for at in counts if c.feasible[at]]
+    won = [c.candidates[b, k] < c.human[b] for b, k in counts]
+    assert (float(sums.pairs), float(sums.wins)) == (len(counts), sum(won))
+    assert len(counts) < np.count_nonzero(c.weight) * K
 
 
 def test_soft_labels_of_collisions():

@@ -99,6 +99,19 @@ def test_a_scene_in_one_pass_is_each_trajectory_by_itself(name, gated):
     near(together(effective, model), apart(drawn(config)))
 
 
+def test_a_linear_reward_is_its_definition():
+    """V = sum over valid t of gamma_t w . z_t, by numpy in float64."""
+    config = RewardConfig(hidden=(), scale_constraint="none")
+    params, x, valid = drawn(config), trajectories(), np.arange(T) < 11
+    gamma, kernel = params["gamma"], params["point"]["out"]["kernel"]
+    assert np.ptp(gamma) > 0.1
+    norm = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), normaliser())
+    z = (np.clip(x, norm.lower, norm.upper) - norm.location) / norm.scale
+    want = np.einsum("t,ktf,f->k", gamma * valid, z, np.asarray(kernel)[:, 0])
+    found = values(params, x, config, jnp.asarray(valid))
+    np.testing.assert_allclose(found, want, rtol=1e-4, atol=1e-4)
+
+
 def test_parameters_of_another_shape_are_refused():
     """Filling up hidden units hides no row that is missing."""
     config = RewardConfig(hidden=(5,), scale_constraint="none")

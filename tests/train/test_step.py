@@ -69,12 +69,10 @@ def weights_of(state):
 
 
 @pytest.mark.parametrize("how", ["pmap", "shard_map"])
-@pytest.mark.parametrize("masked", [False, True])
-def test_eight_devices_equal_one(how, masked):
-    """Also with uneven shards: weights that leave some devices nearly empty."""
+def test_eight_devices_equal_one(how):
+    """With uneven shards: weights that leave some devices nearly empty."""
     weight = np.ones(16)
-    if masked:
-        weight[[1, 2, 3, 4, 5, 9, 10, 11, 15]] = 0.0
+    weight[[1, 2, 3, 4, 5, 9, 10, 11, 15]] = 0.0
     # plain gradient steps: Adam would hide a wrong scale of the gradient
     config = dataclasses.replace(CONFIG, optimizer="sgd", learning_rate=0.3)
     step = make_train_step(config)

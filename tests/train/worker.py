@@ -41,7 +41,6 @@ def main():
         if step == job["kill_after"] + 1 and number in job["victims"]:
             while not saved.exists():  # it is being written while the steps go on
                 time.sleep(0.02)
-            time.sleep(1.0)  # all processes know that it is
             os.kill(os.getpid(), signal.SIGKILL)
 
     pipeline.WINDOW_BLOCKS = 2  # half of the test's data: rows slide through it
