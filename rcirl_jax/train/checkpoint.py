@@ -25,7 +25,7 @@ from orbax.checkpoint import checkpoint_managers
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import read_json, write_json
 from rcirl_jax.runtime.checked import checked
-from rcirl_jax.runtime.pipeline import file_sha256
+from rcirl_jax.runtime.pipeline import digest, file_sha256
 from rcirl_jax.train.parallel import is_first
 from rcirl_jax.train.state import TrainState
 
@@ -105,7 +105,8 @@ class Checkpoints:
         """Notes the digests of a checkpoint's files just before it gets its name."""
         if is_first():
             for folder in self._folder.glob("*.orbax-checkpoint-tmp*"):
-                write_json(folder / DIGESTS, _digests(folder))
+                found = _digests(folder)
+                write_json(folder / DIGESTS, {"files": found, "sha256": digest(found)})
 
     def restore(self, like: TrainState) -> tuple[TrainState, dict]:
         """Returns the newest whole checkpoint and its data position.
@@ -202,8 +203,11 @@ def _newest_whole(folder: Path) -> tuple[int | None, dict[int, str]]:
 def _damage(folder: Path) -> str | None:
     """Returns what is wrong with a checkpoint, if anything."""
     try:
-        noted = checked(read_json(folder / DIGESTS, "digests"), dict[str, str], folder)
-    except InputError:
+        body = read_json(folder / DIGESTS, "digests")
+        noted = checked(body["files"], dict[str, str], folder)
+        if body["sha256"] != digest(noted):
+            return f"{DIGESTS}: damaged"
+    except (InputError, KeyError, TypeError):
         return f"{DIGESTS}: damaged or missing"
     found = _digests(folder)
     for name in sorted(noted.keys() | found.keys()):
