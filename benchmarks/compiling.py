@@ -35,7 +35,6 @@ from rcirl_jax.planner.rank import (
 from rcirl_jax.planner.safety import check
 from rcirl_jax.sampling import sample
 from rcirl_jax.simulation import rollout
-from rcirl_jax.simulation.metrics import MetricsConfig, case_metrics
 from rcirl_jax.simulation.rollout import LANES, RolloutConfig
 from rcirl_jax.simulation.suite import build, suite_refs
 from rcirl_jax.simulation.world import Vehicle, observe, road_limit, start, step
@@ -72,8 +71,7 @@ def _rows() -> dict[str, Row]:
     manner, config = RolloutConfig(steps=STEPS, snapshots=True).split()
 
     def loop(drive: Callable, params: object) -> Row:
-        made = rollout._compiled(drive, _reduced, config, None, True)
-        return made, (params, cases, manner)
+        return rollout._compiled(drive, config, None), (params, cases, manner)
 
     return {
         "sampler": (draw, (keys, scenes)),
@@ -101,10 +99,6 @@ def _rows() -> dict[str, Row]:
         "loop: learned": loop(policy, ranked),
         "loop: hand-set": loop(policy, ranking(weights, "hand-set", (0.0, 0.0))),
     }
-
-
-def _reduced(record: object) -> object:
-    return case_metrics(record, MetricsConfig())
 
 
 def _measured(make: Callable, arguments: tuple) -> dict[str, float]:

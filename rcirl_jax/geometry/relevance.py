@@ -48,6 +48,10 @@ def relevance_distance(
     """
     apart = s - speed * TIMES_S
     along = xp.where(apart < 0.0, -BEHIND_WEIGHT * apart, apart)
-    own = xp.interp(s, xp.arange(path_l.shape[0]) * STATION_STEP_M, path_l)
+    # the grid is uniform: its place is a division, where `interp` would search
+    place = xp.clip(s / STATION_STEP_M, 0.0, path_l.shape[0] - 1.0)
+    low = xp.minimum(place.astype(int), path_l.shape[0] - 2)
+    start, end = xp.moveaxis(path_l[low[..., None] + np.arange(2)], -1, 0)
+    own = start + (place - low) * (end - start)
     aside = xp.maximum(xp.abs(l - own) - half[:, None], 0.0)
     return xp.min(xp.where(seen, along + ASIDE_WEIGHT * aside, xp.inf), axis=1)

@@ -70,7 +70,12 @@ from rcirl_jax.reward.network import (
 )
 from rcirl_jax.sampling import sample
 from rcirl_jax.sampling.kinematics import trajectory_on_path
-from rcirl_jax.sampling.sampler import SamplerConfig, emergency, family_index
+from rcirl_jax.sampling.sampler import (
+    SamplerConfig,
+    as_candidates,
+    emergency,
+    family_index,
+)
 from rcirl_jax.types import (
     Candidates,
     Kind,
@@ -165,12 +170,7 @@ def _grid_rows(
     on_path = jax.vmap(trajectory_on_path, in_axes=(None, 0))(scene, s)
     still = jnp.zeros_like(s)
     trajectory = on_path.replace(v=still + v, a=still, j=still)
-    grid = Candidates(
-        trajectory=trajectory,
-        feasible=jnp.ones((count,), bool),
-        family=jnp.zeros((count,), jnp.int32),
-    )
-    return jnp.stack(features.rows(scene, grid), axis=-1)
+    return jnp.stack(features.rows(scene, as_candidates(trajectory)), axis=-1)
 
 
 def make_lattice(
@@ -649,11 +649,7 @@ def optimality_gap(
         lambda a, b: jnp.where(plan.feasible, a, b), plan.trajectory, trajectory
     )
     stop = emergency_stop(scene)
-    many = Candidates(
-        trajectory=jax.tree.map(lambda *x: jnp.stack(x), trajectory, finer, stop),
-        feasible=jnp.ones((3,), bool),
-        family=jnp.zeros((3,), jnp.int32),
-    )
+    many = as_candidates(jax.tree.map(lambda *x: jnp.stack(x), trajectory, finer, stop))
     values = learned_score(features, activation)(weights, scene, many)
     admissible = check(scene, many, SafetyConfig()).admissible
     best = jnp.max(jnp.where(admissible, values, -jnp.inf))

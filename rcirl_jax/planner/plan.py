@@ -90,17 +90,8 @@ def held(v: jax.Array, a: jax.Array) -> Plan:
     """A plan that holds an acceleration [] m/s^2 from a speed [] m/s until standing."""
     times = jnp.asarray(TIMES_S)
     until = jnp.where(a < 0.0, jnp.minimum(times, v / -jnp.minimum(a, -1e-6)), times)
-    return Plan(
-        s=v * until + 0.5 * a * until**2,
-        v=v + a * until,
-        a=jnp.full_like(times, a),
-        since=jnp.zeros(()),
-        since_choice=jnp.zeros(()),
-        lasts=jnp.zeros((), bool),
-        urgent=jnp.zeros((), bool),
-        fallback=jnp.zeros((), bool),
-        admissible=jnp.zeros((), jnp.int32),
-    )
+    s = v * until + 0.5 * a * until**2
+    return no_plan().replace(s=s, v=v + a * until, a=jnp.full_like(times, a))
 
 
 def command(plan: Plan, v: jax.Array) -> jax.Array:

@@ -31,6 +31,7 @@ from rcirl_jax.report.style import (
     save,
 )
 from rcirl_jax.sampling import SamplerConfig, sample
+from rcirl_jax.sampling.sampler import as_candidates
 from rcirl_jax.train.featurise import human_of
 from rcirl_jax.train.metrics import read_metrics
 from rcirl_jax.types import (
@@ -142,11 +143,7 @@ def draw_frame(
     feasible = np.asarray(candidates.feasible)
     chosen = int(np.argmax(np.where(feasible, values, -np.inf)))
     drawn = one.replace(human=human)
-    only_human = Candidates(
-        trajectory=jax.tree.map(lambda x: x[None], human),
-        feasible=jnp.ones(1, bool),
-        family=jnp.zeros(1, jnp.int32),
-    )
+    only_human = as_candidates(human)
     names = [tag.name.lower() for tag in Tag if bool(one.scene.tags[tag])]
     weights = reward_params(reward)
     parts = _attributed(*weights, x[chosen], x_human, valid, reward.activation)

@@ -128,6 +128,17 @@ def family_index(name: str) -> int:
     return FAMILIES.index(name)
 
 
+def as_candidates(trajectory: Trajectory) -> Candidates:
+    """Trajectories [K, T], or one [T], as candidates that are all feasible."""
+    every = jax.tree.map(jnp.atleast_2d, trajectory)
+    count = every.s.shape[0]
+    return Candidates(
+        trajectory=every,
+        feasible=jnp.ones(count, bool),
+        family=jnp.zeros(count, jnp.int32),
+    )
+
+
 def _speed_families(config: SamplerConfig) -> np.ndarray:
     """Family number of every speed profile, in the order they are built."""
     num_stop = len(config.stop_times) * len(config.stop_gaps)

@@ -265,3 +265,59 @@ class Snapshot(flax.struct.PyTreeNode, kw_only=True):
     agents: AgentState
     plan_s: jax.Array  # [T] m, absolute planned stations
     line_red: jax.Array  # [L] bool: the line demands a stop now
+
+
+# fields of `Driver` that are numbers, and the flags of an agent
+DRIVER = (
+    *("desired", "headway", "standstill", "acceleration", "braking", "delay"),
+    *("politeness", "threshold", "lapse_start", "lapse_end"),
+)
+FLAGS = ("relative", "reacts", "obeys_lines", "changes_lane")
+# what stands in empty slots, where that is not 0
+EMPTY = {"length": 1.0, "width": 1.0, "appear_s": np.inf, "arrival_s": np.inf}
+EMPTY |= {"headway": 1.4, "standstill": 2.0, "acceleration": 1.4, "braking": 2.0}
+EMPTY |= {"desired": 10.0, "lapse_start": np.inf, "lapse_end": np.inf}
+
+
+def lines_of(rows: list[dict[str, float]]) -> Lines:
+    """Lights and stop signs, by the fields of `Lines`; empty slots have kind NONE."""
+
+    def column(name: str) -> np.ndarray:
+        out = np.zeros(NUM_LINES, np.int32 if name == "kind" else np.float32)
+        out[: len(rows)] = [row[name] for row in rows]
+        return out
+
+    return node(Lines, **{name: column(name) for name in Lines.__dataclass_fields__})
+
+
+def agents_of(rows: list[dict[str, Any]]) -> Agents:
+    """Agents with their drivers and scripts; empty slots have kind NONE.
+
+    Args:
+      rows: by the fields of `Agents` and `Driver`; phases (start, speed, rate) and
+        moves (start, l, speed) of `Script`.
+    """
+
+    def column(name: str, kind: type = np.float32) -> np.ndarray:
+        out = np.full(NUM_AGENTS, EMPTY.get(name, 0), kind)
+        out[: len(rows)] = [row[name] for row in rows]
+        return out
+
+    unused = np.array([np.inf, 0.0, 1.0], np.float32)
+    phases = np.tile(unused, (NUM_AGENTS, NUM_PHASES, 1))
+    moves = np.tile(unused, (NUM_AGENTS, NUM_MOVES, 1))
+    for i, row in enumerate(rows):
+        phases[i, : len(row["phases"])] = row["phases"] or phases[i, :0]
+        moves[i, : len(row["moves"])] = row["moves"] or moves[i, :0]
+    flags = {name: column(name, bool) for name in FLAGS}
+    names = ("start", "speed", "rate", "move_start", "move_l", "move_speed")
+    table = [*np.moveaxis(phases, 2, 0), *np.moveaxis(moves, 2, 0)]
+    plain = ("length", "width", "appear_s", "appear_t", "s", "l", "heading", "v")
+    return node(
+        Agents,
+        kind=column("kind", np.int32),
+        relative=flags.pop("relative"),
+        **{name: column(name) for name in (*plain, "v_share", "arrival_s")},
+        driver=node(Driver, **flags, **{name: column(name) for name in DRIVER}),
+        script=node(Script, **dict(zip(names, table, strict=True))),
+    )

@@ -32,6 +32,8 @@ from rcirl_jax.simulation.cases import (
     Case,
     LineKind,
     Perception,
+    agents_of,
+    lines_of,
     node,
 )
 from rcirl_jax.simulation.families import (
@@ -41,9 +43,7 @@ from rcirl_jax.simulation.families import (
     Family,
     Parameter,
     Parts,
-    agents_of,
     family_names,
-    lines_of,
     load_family,
     road_of,
 )
@@ -199,7 +199,7 @@ def _add_elements(family: Family, variables: dict[str, float], parts: Parts) -> 
     parts.shifts += [(f["at"], f["length"], f["l"]) for _, f in values["shift"]]
     for element, f in values["line"]:
         kind = LineKind.LIGHT if element.kind == "light" else LineKind.STOP_SIGN
-        parts.lines.append({**f, "kind": float(kind)})
+        parts.lines.append({**f, "s": f["at"], "kind": kind})
 
 
 def _add_agents(
@@ -328,7 +328,7 @@ def _built(family: Family, index: int, seed: int, duration_s: float) -> Case:
         ego_length=f(EGO_LENGTH_M),
         ego_width=f(EGO_WIDTH_M),
         road=road_of(road, parts),
-        lines=lines_of(parts),
+        lines=lines_of(parts.lines),
         agents=agents_of(parts.agents),
         perception=node(
             Perception,

@@ -19,20 +19,15 @@ from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.simulation.cases import (
-    NUM_AGENTS,
-    NUM_LINES,
+    DRIVER,
+    FLAGS,
     NUM_MOVES,
     NUM_PHASES,
     NUM_ROAD,
     ROAD_STEP_M,
-    Agents,
-    Driver,
-    Lines,
     Road,
-    Script,
     node,
 )
-from rcirl_jax.types import Kind
 
 STATIONS = np.arange(NUM_ROAD) * ROAD_STEP_M  # m, the road grid
 
@@ -77,75 +72,6 @@ def road_of(road: dict[str, float], parts: Parts) -> Road:
     )
 
 
-def lines_of(parts: Parts) -> Lines:
-    """Lights and stop signs; empty slots have kind NONE."""
-    names = {"s": "at", "offset": "offset", "green": "green", "yellow": "yellow"}
-    names["red"] = "red"
-    made = {}
-    for leaf, key in names.items():
-        made[leaf] = np.zeros(NUM_LINES, np.float32)
-        made[leaf][: len(parts.lines)] = [line[key] for line in parts.lines]
-    kind = np.zeros(NUM_LINES, np.int32)
-    kind[: len(parts.lines)] = [int(line["kind"]) for line in parts.lines]
-    return node(Lines, kind=kind, **made)
-
-
-def _column(rows: list[dict], name: str, empty: float) -> np.ndarray:
-    out = np.full(NUM_AGENTS, empty, np.float32)
-    out[: len(rows)] = [row[name] for row in rows]
-    return out
-
-
-def agents_of(rows: list[dict]) -> Agents:
-    """Agents with their drivers and scripts; empty slots have kind NONE."""
-    flags = {name: np.zeros(NUM_AGENTS, bool) for name in FLAGS}
-    for name, values in flags.items():
-        values[: len(rows)] = [row[name] for row in rows]
-    kind = np.full(NUM_AGENTS, Kind.NONE, np.int32)
-    kind[: len(rows)] = [row["kind"] for row in rows]
-    neutral = {"headway": 1.4, "standstill": 2.0, "acceleration": 1.4, "braking": 2.0}
-    neutral |= {"desired": 10.0, "lapse_start": np.inf, "lapse_end": np.inf}
-    plain = ("s", "l", "heading", "v", "v_share", "appear_t")
-    return node(
-        Agents,
-        kind=kind,
-        length=_column(rows, "length", 1.0),
-        width=_column(rows, "width", 1.0),
-        appear_s=_column(rows, "appear_s", np.inf),
-        arrival_s=_column(rows, "arrival_s", np.inf),
-        relative=flags.pop("relative"),
-        **{name: _column(rows, name, 0.0) for name in plain},
-        driver=node(
-            Driver,
-            **flags,
-            **{name: _column(rows, name, neutral.get(name, 0.0)) for name in DRIVER},
-        ),
-        script=_script(rows),
-    )
-
-
-def _script(rows: list[dict]) -> Script:
-    f = np.float32
-    start = np.full((NUM_AGENTS, NUM_PHASES), np.inf, f)
-    speed, rate = np.zeros_like(start), np.ones_like(start)
-    move_start = np.full((NUM_AGENTS, NUM_MOVES), np.inf, f)
-    move_l, move_speed = np.zeros_like(move_start), np.ones_like(move_start)
-    for i, row in enumerate(rows):
-        for p, phase in enumerate(row["phases"]):
-            start[i, p], speed[i, p], rate[i, p] = phase
-        for m, move in enumerate(row["moves"]):
-            move_start[i, m], move_l[i, m], move_speed[i, m] = move
-    return node(
-        Script,
-        start=start,
-        speed=speed,
-        rate=rate,
-        move_start=move_start,
-        move_l=move_l,
-        move_speed=move_speed,
-    )
-
-
 MAX_LENGTH = 400  # characters of an expression
 MAX_EXPONENT = 64.0  # largest |exponent| of a power
 
@@ -166,53 +92,16 @@ def _power(base: float, exponent: float) -> float:
     return float(base) ** exponent
 
 
-# name -> (function, fewest and most arguments)
-FUNCTIONS: dict[str, tuple[Callable, int, int]] = {
-    "min": (min, 2, 8),
-    "max": (max, 2, 8),
-    "abs": (abs, 1, 1),
-    "sqrt": (math.sqrt, 1, 1),
-    "sin": (math.sin, 1, 1),
-    "cos": (math.cos, 1, 1),
-    "tan": (math.tan, 1, 1),
-    "atan": (math.atan, 1, 1),
-    "exp": (math.exp, 1, 1),
-    "log": (math.log, 1, 1),
-    "floor": (math.floor, 1, 1),
-    "round": (round, 1, 1),
-    "clip": (_clip, 3, 3),
-    "where": (_where, 3, 3),
+# names that an expression can call
+FUNCTIONS: dict[str, Callable[..., Any]] = {
+    **{name: getattr(math, name) for name in ("sqrt", "sin", "cos", "tan", "atan")},
+    **{"exp": math.exp, "log": math.log, "floor": math.floor, "round": round},
+    **{"min": min, "max": max, "abs": abs, "clip": _clip, "where": _where},
 }
 
-_ALLOWED = (
-    ast.Expression,
-    ast.BinOp,
-    ast.UnaryOp,
-    ast.BoolOp,
-    ast.Compare,
-    ast.Call,
-    ast.Name,
-    ast.Load,
-    ast.Constant,
-    ast.Add,
-    ast.Sub,
-    ast.Mult,
-    ast.Div,
-    ast.FloorDiv,
-    ast.Mod,
-    ast.Pow,
-    ast.UAdd,
-    ast.USub,
-    ast.Not,
-    ast.And,
-    ast.Or,
-    ast.Lt,
-    ast.LtE,
-    ast.Gt,
-    ast.GtE,
-    ast.Eq,
-    ast.NotEq,
-)
+_SYNTAX = "Expression BinOp UnaryOp BoolOp Compare Call Name Load Constant"
+_SYNTAX += " Add Sub Mult Div FloorDiv Mod Pow UAdd USub Not And Or Lt LtE Gt GtE Eq"
+_ALLOWED = tuple(getattr(ast, name) for name in (*_SYNTAX.split(), "NotEq"))
 
 
 class _Bound(ast.NodeTransformer):
@@ -282,9 +171,6 @@ class Expression:
         name = node.func.id if isinstance(node.func, ast.Name) else "?"
         if name not in FUNCTIONS or node.keywords:
             raise self._refuse(f"call of {name}")
-        _, fewest, most = FUNCTIONS[name]
-        if not fewest <= len(node.args) <= most:
-            raise self._refuse(f"{name} with {len(node.args)} arguments")
 
     def _refuse(self, what: str) -> InputError:
         return InputError(
@@ -313,11 +199,7 @@ class Expression:
 
 
 # names an expression can reach: our functions and nothing built in
-_GLOBALS = {
-    "__builtins__": {},
-    "_power": _power,
-    **{name: function for name, (function, _, _) in FUNCTIONS.items()},
-}
+_GLOBALS = {"__builtins__": {}, "_power": _power, **FUNCTIONS}
 
 
 DISTRIBUTIONS = ("uniform", "normal", "lognormal", "choice")
@@ -345,19 +227,6 @@ ELEMENTS: dict[str, dict[str, float | str | None]] = {
     "shift": {"at": None, "length": None, "l": None},
     "line": {"at": None, "green": 20.0, "yellow": 3.0, "red": 20.0, "offset": 0.0},
 }
-DRIVER = (
-    "desired",
-    "headway",
-    "standstill",
-    "acceleration",
-    "braking",
-    "delay",
-    "politeness",
-    "threshold",
-    "lapse_start",
-    "lapse_end",
-)
-FLAGS = ("relative", "reacts", "obeys_lines", "changes_lane")
 AGENT = {
     "count": 1.0,
     "appear_s": "start",

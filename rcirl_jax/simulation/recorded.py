@@ -12,6 +12,7 @@ that is red for that time, green before and after.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -21,21 +22,21 @@ from scipy.interpolate import CubicHermiteSpline
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.simulation.cases import (
+    DRIVER,
+    FLAGS,
     NUM_AGENTS,
     NUM_LINES,
-    NUM_MOVES,
-    NUM_PHASES,
     NUM_ROAD,
     ROAD_STEP_M,
     STEP_S,
     Agents,
     Case,
-    Driver,
     LineKind,
     Lines,
     Replay,
     Road,
-    Script,
+    agents_of,
+    lines_of,
     node,
     perfect_perception,
 )
@@ -49,63 +50,38 @@ LIMIT_SHARE = 0.8  # 1, desired speed = max(fastest recorded, this share of the 
 KEEPS_LANE = 0.17  # sin of 10 degrees; who heads so keeps a lane (agents.LANE_TILT)
 
 
-def agents_of(tables: dict, limit: np.ndarray) -> Agents:
+def _agents(tables: dict, limit: np.ndarray) -> Agents:
     """The replayed agents, and their driver model once they leave the log.
 
     They never appear by themselves (`appear_s` = inf): the log brings them.
     """
-    kind, present = tables["kind"], tables["present"]
-    drives_by_itself = (kind == Kind.VEHICLE) | (kind == Kind.CYCLIST)
-    first = np.argmax(present, axis=1)[:, None]
-    start = lambda key: np.take_along_axis(tables[key], first, 1)[:, 0]  # noqa: E731
-    fastest = np.max(np.where(present, tables["v"], 0.0), axis=1)
-    share = np.max(np.where(present, limit * LIMIT_SHARE, 0.0), axis=1)
-    share = np.where(kind == Kind.VEHICLE, share, 0.0)
-    sine, cosine = (
-        np.sum(np.where(present, wave(tables["heading"]), 0.0), axis=1)
-        for wave in (np.sin, np.cos)
-    )
-    heading = np.arctan2(sine, cosine)
-    along = np.where(cosine >= 0.0, 0.0, np.pi)
-    heading = np.where(np.abs(np.sin(heading)) < KEEPS_LANE, along, heading)
-    fill = lambda value: np.full(NUM_AGENTS, value, np.float32)  # noqa: E731
-    driver = node(
-        Driver,
-        desired=np.maximum(fastest, share).astype(np.float32),
-        **{name: fill(value) for name, value in MEDIAN.items()},
-        reacts=drives_by_itself,
-        obeys_lines=kind == Kind.VEHICLE,
-        changes_lane=np.zeros(NUM_AGENTS, bool),
-        politeness=fill(0.0),
-        threshold=fill(np.inf),
-        lapse_start=fill(np.inf),
-        lapse_end=fill(np.inf),
-    )
-    phases, moves = (NUM_AGENTS, NUM_PHASES), (NUM_AGENTS, NUM_MOVES)
-    script = node(
-        Script,
-        start=np.full(phases, np.inf, np.float32),
-        speed=np.zeros(phases, np.float32),
-        rate=np.ones(phases, np.float32),
-        move_start=np.full(moves, np.inf, np.float32),
-        move_l=np.zeros(moves, np.float32),
-        move_speed=np.ones(moves, np.float32),
-    )
-    script.start[kind == Kind.STATIC, 0] = 0.0  # target speed 0: stays where it is
-    return node(
-        Agents,
-        kind=kind,
-        **{name: tables[name].astype(np.float32) for name in ("length", "width")},
-        appear_s=fill(np.inf),
-        appear_t=fill(0.0),
-        relative=np.zeros(NUM_AGENTS, bool),
-        **{name: start(name).astype(np.float32) for name in ("s", "l", "v")},
-        heading=heading.astype(np.float32),
-        v_share=fill(0.0),
-        arrival_s=fill(np.inf),
-        driver=driver,
-        script=script,
-    )
+    rows = []
+    for i in np.flatnonzero(tables["kind"] != Kind.NONE):
+        kind, present = tables["kind"][i], tables["present"][i]
+        angle, first = tables["heading"][i], np.argmax(present)
+        sine, cosine = (
+            np.sum(np.where(present, wave(angle), 0.0)) for wave in (np.sin, np.cos)
+        )
+        heading = np.arctan2(sine, cosine)
+        if np.abs(np.sin(heading)) < KEEPS_LANE:
+            heading = 0.0 if cosine >= 0.0 else np.pi
+        desired = np.max(np.where(present, tables["v"][i], 0.0))
+        if kind == Kind.VEHICLE:
+            share = np.max(np.where(present, limit[i] * LIMIT_SHARE, 0.0))
+            desired = max(desired, share)
+        names = (*DRIVER, *FLAGS, "appear_t", "v_share")
+        row: dict[str, Any] = dict.fromkeys(names, 0.0) | MEDIAN
+        row |= {name: tables[name][i] for name in ("kind", "length", "width")}
+        row |= {name: tables[name][i, first] for name in ("s", "l", "v")}
+        row |= dict.fromkeys(("threshold", "lapse_start", "lapse_end"), np.inf)
+        row |= dict.fromkeys(("appear_s", "arrival_s"), np.inf)
+        row |= {"heading": heading, "desired": desired}
+        row["reacts"] = kind in (Kind.VEHICLE, Kind.CYCLIST)
+        row["obeys_lines"] = kind == Kind.VEHICLE
+        # target speed 0: stays where it is
+        row["phases"] = [(0.0, 0.0, 1.0)] if kind == Kind.STATIC else []
+        rows.append({**row, "moves": []})
+    return agents_of(rows)
 
 
 STEPS = round(HORIZON_S / STEP_S)  # of a case; one with a shorter record is padded
@@ -227,7 +203,7 @@ def case_of(one: Demonstration) -> Case:
         ego_width=single(scene.ego.width),
         road=_road(one),
         lines=lines,
-        agents=agents_of(tables, limit),
+        agents=_agents(tables, limit),
         perception=perfect_perception(),
         replay=node(
             Replay,
@@ -329,22 +305,18 @@ def _filled(values: np.ndarray, default: float) -> np.ndarray:
 def _lines(one: Demonstration) -> Lines:
     """Lines that demanded a stop as lights: red for the time of the demand."""
     o = one.scene.obstacles
-    names = ("s", "offset", "green", "yellow", "red")
-    table = {name: np.zeros(NUM_LINES, np.float32) for name in names}
-    kind = np.zeros(NUM_LINES, np.int32)
+    rows: list[dict[str, Any]] = []
     valid = np.asarray(o.valid)
     stops = np.flatnonzero((np.asarray(o.kind) == Kind.STOP) & valid.any(axis=1))
-    for line, slot in enumerate(stops[:NUM_LINES]):
+    for slot in stops[:NUM_LINES]:
         first, last = np.flatnonzero(valid[slot])[[0, -1]]
         begins, ends = TIMES_S[first], TIMES_S[last] + DT_S
         if last == TIMES_S.size - 1:
             ends = LONG_S
-        kind[line] = LineKind.LIGHT
-        table["s"][line] = np.asarray(o.s_lower)[slot, first]
-        table["green"][line] = LONG_S
-        table["red"][line] = ends - begins
-        table["offset"][line] = LONG_S - begins
-    return node(Lines, kind=kind, **table)
+        row = {"kind": LineKind.LIGHT, "s": np.asarray(o.s_lower)[slot, first]}
+        row |= {"green": LONG_S, "yellow": 0.0, "red": ends - begins}
+        rows.append({**row, "offset": LONG_S - begins})
+    return lines_of(rows)
 
 
 def _road(one: Demonstration) -> Road:

@@ -188,15 +188,9 @@ def _packed(logs: tuple[Record, Snapshot | None]) -> jax.Array:
 
 def _unpacked(packed: Any, cases: Case, snapshots: bool) -> tuple:  # noqa: ANN401
     """Records and snapshots [...] of packed ones [..., L]; numpy's or JAX's."""
-
-    def logged(case: Case) -> tuple[Record, Snapshot | None]:
-        world = start(case)
-        after, record = step(case, world, case.ego_v, case.ego_v > 0.0, Vehicle())
-        shot = _snapshot(case, world, after, no_plan()) if snapshots else None
-        return record, shot
-
-    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), cases)
-    leaves, tree = jax.tree.flatten(jax.eval_shape(logged, one))
+    given, case = jax.tree.flatten(cases)
+    kinds = tuple(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in given)
+    leaves, tree = _layout(case, kinds, snapshots)
     ends = np.cumsum([leaf.size for leaf in leaves])
     parts = [
         packed[..., end - leaf.size : end]
@@ -207,23 +201,38 @@ def _unpacked(packed: Any, cases: Case, snapshots: bool) -> tuple:  # noqa: ANN4
     return jax.tree.unflatten(tree, parts)
 
 
+@functools.lru_cache(maxsize=8)
+def _layout(case: Any, kinds: tuple, snapshots: bool) -> tuple[list, Any]:  # noqa: ANN401
+    """What `_packed` packs of a case of leaves of these kinds: leaves, their tree."""
+
+    def logged(case: Case) -> tuple[Record, Snapshot | None]:
+        world = start(case)
+        after, record = step(case, world, case.ego_v, case.ego_v > 0.0, Vehicle())
+        shot = _snapshot(case, world, after, no_plan()) if snapshots else None
+        return record, shot
+
+    return jax.tree.flatten(jax.eval_shape(logged, jax.tree.unflatten(case, kinds)))
+
+
 @functools.lru_cache(maxsize=32)
 def _compiled(
-    policy: Policy,
-    reduce: Callable[[Record], Logs] | None,
-    config: RolloutConfig,
-    takeover_policy: Policy | None,
-    keep: bool,
+    policy: Policy, config: RolloutConfig, takeover_policy: Policy | None
 ) -> Callable:
     def run(params: Params, cases: Case, manner: Manner) -> Logs:
-        logs = rollout(policy, params, cases, config, manner, takeover_policy)
-        if reduce is None:
-            return logs
-        record, _ = _unpacked(logs[0], cases, config.snapshots)
-        made = jax.vmap(reduce, in_axes=1)(record)
-        return (made, logs) if keep else made
+        return rollout(policy, params, cases, config, manner, takeover_policy)
 
     return jax.jit(run)
+
+
+@functools.lru_cache(maxsize=8)
+def _reducer(reduce: Callable[[Record], Logs], snapshots: bool) -> Callable:
+    """A program of its own: whoever drove, records are judged by the same."""
+
+    def judge(packed: jax.Array, cases: Case) -> Logs:
+        record, _ = _unpacked(packed, cases, snapshots)
+        return jax.vmap(reduce, in_axes=1)(record)
+
+    return jax.jit(judge)
 
 
 # Cases a CPU drives side by side. XLA compiles other code for other shapes and
@@ -245,9 +254,9 @@ def drive_cases(
     """All cases [B]: (records, snapshots, scenes), or what `reduce` makes of them.
 
     On a CPU a batch that is a multiple of `LANES` runs in groups of that many, else
-    all cases at once. With `reduce` the records never leave the device; on a CPU,
-    where they need not move, they are made and dropped: so one program serves the
-    suite and the pictures of its cases, and draws the very drives.
+    all cases at once. With `reduce` the records never leave the device, and on a CPU
+    there are snapshots too: so one program serves the suite and the pictures of its
+    cases, and draws the very drives.
 
     Args:
       policy: who drives.
@@ -263,28 +272,23 @@ def drive_cases(
     """
     total = cases.steps.shape[0]
     in_groups = total % LANES == 0 and jax.default_backend() == "cpu"
-    keeps = reduce is not None and (keep or in_groups)
-    if keeps:
+    if reduce is not None and (keep or in_groups):
         config = dataclasses.replace(config, snapshots=True)
     manner, config = config.split()
-    drive = _compiled(policy, reduce, config, takeover_policy, keeps)
+    drive = _compiled(policy, config, takeover_policy)
 
     def group(first: int) -> Logs:
         lanes = slice(first, first + (LANES if in_groups else total))
         part = jax.tree.map(lambda leaf: leaf[lanes], cases)
-        made = jax.block_until_ready(drive(params, part, manner))
+        logs = jax.block_until_ready(drive(params, part, manner))
+        made = reduce and _reducer(reduce, config.snapshots)(logs[0], part)
+        if reduce and not keep:
+            return jax.block_until_ready(made)
         # time comes first in the program: a view, where a program would copy
         by_case = lambda x: np.swapaxes(np.asarray(x), 0, 1)  # noqa: E731
-
-        def kept(logs: tuple) -> Logs:
-            packed, scenes = jax.tree.map(by_case, logs)
-            return *_unpacked(packed, part, config.snapshots), scenes
-
-        if reduce is None:
-            return kept(made)
-        if keep:
-            return made[0], kept(made[1])
-        return made[0] if keeps else made
+        packed, scenes = jax.tree.map(by_case, logs)
+        kept = *_unpacked(packed, part, config.snapshots), scenes
+        return (made, kept) if keep else kept
 
     if not in_groups:
         return group(0)

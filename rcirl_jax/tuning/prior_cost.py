@@ -35,9 +35,10 @@ from rcirl_jax.reward.familiarity import (
 )
 from rcirl_jax.runtime.atomic_files import read_json, write_json
 from rcirl_jax.sampling import trajectory_on_path
+from rcirl_jax.sampling.sampler import as_candidates
 from rcirl_jax.tuning.recipes import PriorCostConfig
 from rcirl_jax.tuning.run import Run
-from rcirl_jax.types import Candidates, Scene
+from rcirl_jax.types import Scene
 from rcirl_jax.units import TIMES_S
 
 OWN_COST = "hand-set"  # what stands for the planner's own cost here
@@ -125,12 +126,8 @@ def _scene_features(scenes: Scene, features: FeatureMap) -> jax.Array:
     def one(scene: Scene) -> jax.Array:
         scene = with_predicted_futures(scene)
         straight = trajectory_on_path(scene, scene.ego.v * jnp.asarray(TIMES_S))
-        only = Candidates(
-            trajectory=jax.tree.map(lambda x: x[None], straight),
-            feasible=jnp.ones(1, bool),
-            family=jnp.zeros(1, jnp.int32),
-        )
-        return jnp.stack([row[0, 0] for row in features.rows(scene, only)])
+        rows = features.rows(scene, as_candidates(straight))
+        return jnp.stack([row[0, 0] for row in rows])
 
     return jax.lax.map(one, scenes, batch_size=LANES)
 

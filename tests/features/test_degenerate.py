@@ -14,11 +14,12 @@ from rcirl_jax.features.columns import relate, slots
 from rcirl_jax.planner.rank import hand_score, learned_score
 from rcirl_jax.reward import LOSSES, RewardConfig, effective_params, init_params
 from rcirl_jax.sampling import SamplerConfig, trajectory_on_path
+from rcirl_jax.sampling.sampler import as_candidates
 from rcirl_jax.train import featurise as making
 from rcirl_jax.train.featurise import featurise, host_batch
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.train.step import gradient_sums, init_state
-from rcirl_jax.types import Candidates, Kind
+from rcirl_jax.types import Kind
 from rcirl_jax.units import NUM_OBSTACLES, NUM_TIMES, TIMES_S
 from tests.features.oracle import motion
 from tests.helpers.scenes import (
@@ -59,14 +60,6 @@ def weights():
         return effective_params(params, REWARD), normaliser()
 
 
-def one_of(trajectory):
-    return Candidates(
-        trajectory=jax.tree.map(lambda x: x[None], trajectory),
-        feasible=jnp.ones(1, bool),
-        family=jnp.zeros(1, jnp.int32),
-    )
-
-
 LEARNED = learned_score(feature_map("paper21"), "tanh")
 
 
@@ -75,7 +68,7 @@ def slope(made, s):
     """V of stations [T] and its gradient."""
 
     def value(s):
-        return LEARNED(weights(), made, one_of(trajectory_on_path(made, s)))[0]
+        return LEARNED(weights(), made, as_candidates(trajectory_on_path(made, s)))[0]
 
     return jax.value_and_grad(value)(s)
 
@@ -90,7 +83,7 @@ def columns(made, s):
 
 @jax.jit
 def hand_value(made, s):
-    return hand_score(None, made, one_of(trajectory_on_path(made, s)))
+    return hand_score(None, made, as_candidates(trajectory_on_path(made, s)))
 
 
 def drives(made):

@@ -13,7 +13,8 @@ from rcirl_jax.planner.dp import DpConfig, plan_dp
 from rcirl_jax.planner.rank import learned_score
 from rcirl_jax.reward import RewardConfig, effective_params, init_params
 from rcirl_jax.sampling.kinematics import trajectory_on_path
-from rcirl_jax.types import Candidates, Normaliser
+from rcirl_jax.sampling.sampler import as_candidates
+from rcirl_jax.types import Normaliser
 from tests.helpers.scenes import random_scene
 
 FEATURES = feature_map("paper21")
@@ -48,17 +49,9 @@ def planner(config):
     return jax.jit(lambda s, w: plan_dp(s, w, FEATURES, SHAPE.activation, config))
 
 
-def one(trajectory):
-    return Candidates(
-        trajectory=jax.tree.map(lambda x: x[None], trajectory),
-        feasible=jnp.ones(1, bool),
-        family=jnp.zeros(1, jnp.int32),
-    )
-
-
 @jax.jit
 def network_value(scene, trajectory, w):
-    return SCORE(w, scene, one(trajectory))[0]
+    return SCORE(w, scene, as_candidates(trajectory))[0]
 
 
 def scene_of(seed):
@@ -125,14 +118,10 @@ def enumerate_best(made, config, depth, w):
                 plans.append(stations)
     s = jnp.asarray(plans, jnp.float32) * step_s + made.ego.s
     trajectory = jax.jit(jax.vmap(trajectory_on_path, (None, 0)))(made, s)
-    many = Candidates(
-        trajectory=trajectory,
-        feasible=jnp.ones(len(plans), bool),
-        family=jnp.zeros(len(plans), jnp.int32),
-    )
     # the lattice takes no plan whose speed turns negative at the last counted time
     counted = np.asarray(trajectory.v)[:, : depth + 2].min(axis=1) > -1e-3
-    return np.asarray(SCORE(w, made, many))[counted], np.asarray(plans)[counted]
+    values = np.asarray(SCORE(w, made, as_candidates(trajectory)))
+    return values[counted], np.asarray(plans)[counted]
 
 
 @pytest.mark.parametrize("seed", [1, 3, 4])

@@ -22,9 +22,10 @@ from rcirl_jax.planner.rank import (
     rank_policy,
 )
 from rcirl_jax.sampling.kinematics import trajectory_on_path
+from rcirl_jax.sampling.sampler import as_candidates
 from rcirl_jax.units import TIMES_S
 from tests.helpers.scenes import batch, random_scene, sampled, scene
-from tests.planner.test_dp import COARSE, FEATURES, SCORE, SHAPE, one, planner, weights
+from tests.planner.test_dp import COARSE, FEATURES, SCORE, SHAPE, planner, weights
 from tests.planner.test_safety import judge
 
 MEASURE = jax.jit(
@@ -41,8 +42,10 @@ def test_the_gap_is_the_value_to_the_best_admissible_plan():
     fine = np.flatnonzero(judge(FREE, candidates).admissible)[[0, 7]]
     plans = [jax.tree.map(lambda x, i=i: x[i], candidates.trajectory) for i in fine]
     plans += [lattice.trajectory, stop]
-    values = np.array([float(SCORE(w, FREE, one(x))[0]) for x in plans])
-    passes = np.array([bool(judge(FREE, one(x)).admissible[0]) for x in plans])
+    values = np.array([float(SCORE(w, FREE, as_candidates(x))[0]) for x in plans])
+    passes = np.array(
+        [bool(judge(FREE, as_candidates(x)).admissible[0]) for x in plans]
+    )
     assert passes[2]
     assert values[2] > values[:2].max()  # so it is the best of every question
     found = [MEASURE(FREE, x, w) for x in plans]

@@ -11,7 +11,8 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.planner.rank import ONLINE
 from rcirl_jax.planner.safety import SafetyConfig, Verdict, check, choose, first_contact
 from rcirl_jax.sampling.kinematics import trajectory_on_path
-from rcirl_jax.types import Candidates, Kind
+from rcirl_jax.sampling.sampler import as_candidates
+from rcirl_jax.types import Kind
 from rcirl_jax.units import DT_S, TIMES_S
 from tests.helpers.scenes import random_scene, sampled, scene
 
@@ -77,11 +78,7 @@ def test_swept_boxes_equal_dense_sampling(seed):
 def straight(made, v):
     """One candidate of constant speed."""
     x = trajectory_on_path(made, v * jnp.asarray(TIMES_S))
-    return Candidates(
-        trajectory=jax.tree.map(lambda a: a[None], x),
-        feasible=jnp.ones(1, bool),
-        family=jnp.zeros(1, jnp.int32),
-    )
+    return as_candidates(x)
 
 
 def with_obstacle(kind, s, l, v=10.0, speed=0.0, sideways=0.0, length=4.0, width=1.8):

@@ -9,7 +9,6 @@ import pytest
 from rcirl_jax.errors import InputError
 from rcirl_jax.report.replays import AHEAD_M, BEHIND_M, FRAME_STEPS, make_replays
 from rcirl_jax.simulation import rollout
-from rcirl_jax.simulation import suite as suite_module
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.recorded import held_out
 from rcirl_jax.simulation.rollout import LANES, drive_cases
@@ -71,7 +70,7 @@ def test_the_drives_are_those_of_the_suite():
     config = rollout_config(row, cases.duration_s, 1)
     suite = drive_row(row, cases.build, len(cases.ids), config, chunk=60)
     _, kept = dataclasses.replace(config, snapshots=True).split()
-    program = rollout._compiled(row.policy, suite_module._reduced, kept, None, True)
+    program = rollout._compiled(row.policy, kept, None)
     assert program._cache_size() == 1
     at = cases.ids.index(PLAYED[0])
     found, record, shot = drive_with_logs(row, cases.build(at, at + 1), config)

@@ -99,7 +99,7 @@ def test_the_others_drive_as_medians_once_they_leave_the_log():
         assert (agents.script.start[0, 0] == 0.0) == (kind == Kind.STATIC)
     usual = {"headway": 1.4, "standstill": 2.0, "acceleration": 1.4, "braking": 2.0}
     for name, value in {**usual, "delay": 0.4}.items():
-        np.testing.assert_allclose(getattr(fast, name), value)
+        np.testing.assert_allclose(getattr(fast, name)[:3], value)
 
 
 def test_held_out_drives_are_a_suite():
