@@ -224,9 +224,8 @@ def run(folder: Path) -> Target:
     step.mkdir()
     (step / "state").write_bytes(b"numbers")
     found = {"state": hashlib.sha256(b"numbers").hexdigest()}
-    digests, position = step / checkpoint.DIGESTS, folder / checkpoint.POSITION
+    digests = step / checkpoint.DIGESTS
     digests.write_text(json.dumps({"files": found, "sha256": checkpoint.digest(found)}))
-    position.write_text(json.dumps({"epoch": 1, "position": 12, "seed": 0}))
     metrics, sweep = folder / "metrics.jsonl", folder / SWEEP
     rows = [json.dumps({"step": k, **line, "queries_per_s": None}) for k in (1, 2, 3)]
     metrics.write_text("\n".join(rows) + "\n")
@@ -239,7 +238,6 @@ def run(folder: Path) -> Target:
         metrics: lambda: (last_metrics(folder), pairs_won(metrics, 2)),
         sweep: lambda: read_sweep(folder),
         digests: lambda: checkpoint._newest_whole(folder),
-        position: lambda: checkpoint.read_position(position),
     }
     return Target(read=lambda file: readers[file](), files=[*readers])
 
