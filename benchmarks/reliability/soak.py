@@ -41,8 +41,7 @@ from rcirl_jax.runtime.executors import Serial
 from rcirl_jax.train.loop import Running
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.tuning.loop import tune
-from rcirl_jax.tuning.recipes import TuneConfig
-from rcirl_jax.tuning.run import Run
+from rcirl_jax.tuning.run import Run, TuneConfig
 
 _SECONDS = flags.DEFINE_float("seconds", 1200.0, "of the whole soak")
 _LEAK = flags.DEFINE_float("leak", 0.0, "MiB kept of every round, to be found")

@@ -29,8 +29,8 @@ from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.simulation.suite import case_duration, suite_refs
 from rcirl_jax.train.loop import Running
 from rcirl_jax.tuning.loop import tune as run_stages
-from rcirl_jax.tuning.recipes import DEFAULT, TuneConfig, load_recipe
-from rcirl_jax.tuning.run import Run
+from rcirl_jax.tuning.recipes import DEFAULT, load_recipe
+from rcirl_jax.tuning.run import Run, TuneConfig
 from rcirl_jax.tuning.stages import verdict_of
 
 

@@ -28,8 +28,8 @@ from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.train.loop import Running
 from rcirl_jax.train.parallel import PARALLEL, share_cores
 from rcirl_jax.tuning.loop import STAGES, tune
-from rcirl_jax.tuning.recipes import EXPERTS, TuneConfig
-from rcirl_jax.tuning.run import Run
+from rcirl_jax.tuning.recipes import EXPERTS
+from rcirl_jax.tuning.run import Run, TuneConfig
 
 USUAL = (
     *("output", "data", "input", "format", "source", "synthetic", "recipe"),

@@ -9,21 +9,17 @@ stands for the preset's context columns), [train.sampler] of `SamplerConfig`, [c
 of `CollectConfig`, [simulated_demonstrations] of `SimulatedDemonstrations`,
 [prior_cost] of `PriorCostConfig`. What a file leaves out is the field's own default.
 Nothing else has a default of its own: commands take a recipe, and flags given beside it
-win. `TuneConfig` is a recipe with the settings of one run.
+win.
 """
 
 import contextlib
 import dataclasses
-import importlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.store.dataset import EQUAL
 from rcirl_jax.errors import InputError, did_you_mean
-from rcirl_jax.evaluation.gate.types import GateConfig
-from rcirl_jax.export.sweep import read_sweep
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.runtime.checked import check_names, typed_fields, typed_settings
@@ -268,44 +264,3 @@ def override(
         bool(base.reward.scene_gating) if scene_gating is None else scene_gating,
     )
     return dataclasses.replace(base, **rest, seed=seed, reward=reward)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TuneConfig:
-    """Everything that decides the outcome, besides the data."""
-
-    train: TrainConfig
-    gate: GateConfig
-    incumbent: str = "hand-set"  # weights file or baseline
-    simulated: SimulatedDemonstrations = dataclasses.field(
-        default_factory=SimulatedDemonstrations
-    )
-    prior_cost: PriorCostConfig = PriorCostConfig()
-    data_weights: str = EQUAL  # of several sources, as `data.store.dataset.shares_of`
-    recipe: str = ""  # its name, for the report
-    seeds: int = 1
-    search: str = "cma"  # of the tuned IDM: one of `baselines.SEARCHES`
-    drives: int = 240  # held-out, for human-likeness
-    horizon_s: float = 5.0
-    suite: str = "full"
-    cases: int | None = None  # per family
-    duration_s: float | None = None
-    catalogue_seed: int = 0
-    plan_every: int = 1
-    sweep: Path | None = None  # of `rcirl sweep`, shown in the report
-
-    def __post_init__(self) -> None:
-        """Rejects settings that would fail only after the training."""
-        if self.sweep is not None:
-            read_sweep(self.sweep)
-        if self.search == "optuna":
-            importlib.import_module("optuna")  # an extra
-        if self.drives < 1:
-            raise InputError(f"drives: {self.drives}: expected at least 1")
-        if self.seeds < 1:
-            raise InputError(f"seeds: {self.seeds}: expected at least 1")
-        if self.train.sampler.mode != "speed":
-            raise InputError(
-                f"mode: {self.train.sampler.mode}: the closed loop plans speed"
-            )
-        self.train.reward.check_own()

@@ -20,18 +20,23 @@ RUN/stages.json        what made what (`stages`)
 """
 
 import dataclasses
+import importlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from rcirl_jax.data.store.dataset import Dataset
+from rcirl_jax.data.store.dataset import EQUAL, Dataset
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.gate.types import GateConfig
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import Reward
+from rcirl_jax.export.sweep import read_sweep
 from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.runtime.pipeline import Stages, code_sha256, file_sha256
 from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.train.loop import Running
-from rcirl_jax.tuning.recipes import TuneConfig
+from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.tuning.recipes import PriorCostConfig, SimulatedDemonstrations
 
 # what reads as permission to use weights that are no longer there
 STALE = {
@@ -45,6 +50,47 @@ NOTED = ("git_commit", "code_sha256", "versions", "flags")  # of every stage
 def _say(line: str) -> None:
     """A line that is seen at once, also where it goes into a file."""
     print(line, flush=True)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TuneConfig:
+    """Everything that decides the outcome, besides the data."""
+
+    train: TrainConfig
+    gate: GateConfig
+    incumbent: str = "hand-set"  # weights file or baseline
+    simulated: SimulatedDemonstrations = dataclasses.field(
+        default_factory=SimulatedDemonstrations
+    )
+    prior_cost: PriorCostConfig = dataclasses.field(default_factory=PriorCostConfig)
+    data_weights: str = EQUAL  # of several sources, as `data.store.dataset.shares_of`
+    recipe: str = ""  # its name, for the report
+    seeds: int = 1
+    search: str = "cma"  # of the tuned IDM: one of `baselines.SEARCHES`
+    drives: int = 240  # held-out, for human-likeness
+    horizon_s: float = 5.0
+    suite: str = "full"
+    cases: int | None = None  # per family
+    duration_s: float | None = None
+    catalogue_seed: int = 0
+    plan_every: int = 1
+    sweep: Path | None = None  # of `rcirl sweep`, shown in the report
+
+    def __post_init__(self) -> None:
+        """Rejects settings that would fail only after the training."""
+        if self.sweep is not None:
+            read_sweep(self.sweep)
+        if self.search == "optuna":
+            importlib.import_module("optuna")  # an extra
+        if self.drives < 1:
+            raise InputError(f"drives: {self.drives}: expected at least 1")
+        if self.seeds < 1:
+            raise InputError(f"seeds: {self.seeds}: expected at least 1")
+        if self.train.sampler.mode != "speed":
+            raise InputError(
+                f"mode: {self.train.sampler.mode}: the closed loop plans speed"
+            )
+        self.train.reward.check_own()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
