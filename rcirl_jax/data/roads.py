@@ -21,7 +21,7 @@ from scipy.spatial import KDTree
 from rcirl_jax.types import Kind, Lane, Track
 
 STEP_M = 1.0  # m between samples of a track and points of a lane
-SMOOTH_S = 1.2  # s, window over a track's positions
+SMOOTH_S = 0.8  # s, window over a track's positions
 BASE_M = 3.0  # m to both sides over which a direction is taken
 MOVING_MPS = 0.5  # m/s; below it positions only jitter
 MAX_TRACKS = 1500  # tracks that are looked at, evenly over the log
@@ -35,7 +35,7 @@ COVERED = 0.45  # of a lane's width: positions nearer to a lane need no other
 JOIN_M = 1.2  # m between lanes that have become one
 BLEND_M = 24.0  # m in which a lane that joins another comes onto its middle
 TAPER_M = 60.0  # m, likewise of one that ends beside it
-SHORTEST_M = (25.0, 15.0, 6.0)  # m of a lane that joins others at so many ends
+SHORTEST_M = (25.0, 15.0, 3.0)  # m of a lane that joins others at so many ends
 MIN_PIECE_M = 15.0  # m, shortest piece that a neighbour's begin or end makes
 EXTRA_M = 20.0  # m of lane beyond the first and last position
 PIECE_M = 400.0  # m, longest piece
@@ -273,6 +273,11 @@ def _ways(line: np.ndarray) -> np.ndarray:
     return step / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
 
 
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns the sine between unit vectors [.., 2], above 0 where b is to the left."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
 def _arc(line: np.ndarray) -> np.ndarray:
     return np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
 
@@ -365,6 +370,9 @@ def _led_onto(
     ridge, sense = ridges[number], 1 if is_end else -1
     line, target = ridge.line[::sense], ridges[other].line[::sense]
     (begin,), (left,) = _left_of(target, line[-1:])
+    slope = float(_cross(_ways(target)[begin], _ways(line)[-1]))
+    if left * slope < 0.0:  # as long as it takes at the angle at which they meet
+        blend = float(np.clip(2.0 * abs(left / slope), SHORTEST_M[2], blend))
     last = min(begin + round(blend / STEP_M), len(target) - 1)
     share = np.linspace(0.0, 1.0, last - begin + 1)[1:, None]
     ways = _ways(target)[begin + 1 : last + 1]

@@ -1,0 +1,147 @@
+"""Lanes estimated from tracks lie where the true ones do, linked as they are."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from rcirl_jax.data.roads import roads_from_tracks
+from tests.helpers.driven_roads import country_road, crossing, highway
+
+DRIVEN = {
+    "two lanes and a slip road": highway(),
+    "four narrow lanes": highway(1, lanes=4, width=3.1),
+    "a country road": country_road(),
+    "a crossing": crossing(),
+}
+
+
+@pytest.fixture(scope="module", params=DRIVEN)
+def case(request):
+    driven = DRIVEN[request.param]
+    return request.param, driven, roads_from_tracks(driven.tracks)
+
+
+def chain_near(lanes, line):
+    """Points of the lanes that head along a line, joined."""
+    ways = np.gradient(line, axis=0)
+    tree, parts = KDTree(line), []
+    for lane in lanes:
+        apart, at = tree.query(lane.centre)
+        own = np.gradient(lane.centre, axis=0)
+        cosine = np.sum(own * ways[at], axis=1)
+        cosine /= np.hypot(*own.T) * np.hypot(*ways[at].T)
+        parts.append(lane.centre[(apart < 1.7) & (cosine > 0.85)])
+    return np.concatenate(parts)
+
+
+def test_every_true_lane_is_found_within_0_3_m(case):
+    name, driven, roads = case
+    for lane, line in driven.lanes.items():
+        found = KDTree(chain_near(roads.lanes, line))
+        apart = found.query(line[5:-5])[0]
+        share = np.mean(apart < 0.6)  # points of a lane are a metre apart
+        assert share > 0.95, (name, lane, share)
+        # across: the distance less what lies along
+        inner = line[5:-5]
+        way = np.gradient(inner, axis=0)
+        way /= np.hypot(*way.T)[:, None]
+        gap = found.data[found.query(inner)[1]] - inner
+        left = way[:, 0] * gap[:, 1] - way[:, 1] * gap[:, 0]
+        assert np.percentile(np.abs(left), 90) < 0.3, (name, lane)
+
+
+def dense(line):
+    """A line of points a metre apart, ten times as many."""
+    at = np.arange(0.0, len(line) - 1.0, 0.1)
+    return np.stack([np.interp(at, np.arange(len(line)), x) for x in line.T], axis=1)
+
+
+def test_there_is_no_lane_that_nobody_drives_on(case):
+    _, driven, roads = case
+    every = KDTree(np.concatenate([dense(line) for line in driven.lanes.values()]))
+    points = [lane.centre[1:-1] for lane in roads.lanes if len(lane.centre) > 2]
+    apart = every.query(np.concatenate(points))[0]
+    # but where one lane comes onto another
+    assert np.mean(apart < 0.3) > 0.9
+    assert roads.explained > 0.97
+
+
+def test_widths_and_neighbours(case):
+    name, _, roads = case
+    by_id = {lane.id: lane for lane in roads.lanes}
+    width = {"two lanes and a slip road": 3.6, "four narrow lanes": 3.1}.get(name)
+    if width is None:
+        assert np.isnan(roads.width)
+        assert all(lane.left is lane.right is None for lane in roads.lanes)
+        return
+    assert roads.width == pytest.approx(width, abs=0.1)
+    long = [x for x in roads.lanes if len(x.centre) > 60]
+    pairs = [(x, by_id[x.left]) for x in long if x.left]
+    assert len(pairs) >= 3
+    for right, left in pairs:
+        middle = right.centre[len(right.centre) // 2]
+        way = np.gradient(right.centre, axis=0)[len(right.centre) // 2]
+        gap = left.centre[KDTree(left.centre).query(middle)[1]] - middle
+        across = (way[0] * gap[1] - way[1] * gap[0]) / np.hypot(*way)
+        assert across == pytest.approx(width, abs=0.4)
+
+
+def test_successors_go_on_where_a_lane_ends(case):
+    _, _, roads = case
+    by_id = {lane.id: lane for lane in roads.lanes}
+    for lane in roads.lanes:
+        for name in lane.successors:
+            after = by_id[name].centre
+            assert np.hypot(*(after[0] - lane.centre[-1])) < 2.5
+            out = lane.centre[-1] - lane.centre[-2]
+            onto = after[min(3, len(after) - 1)] - after[0]
+            assert out @ onto > 0.7 * np.hypot(*out) * np.hypot(*onto)
+
+
+def test_a_slip_road_leads_onto_the_road_and_a_crossing_to_three_arms():
+    for name, begin, ends in (
+        ("two lanes and a slip road", "slip", ["0"]),
+        ("a crossing", "0 on", ["0 on", "0 left", "0 right"]),
+    ):
+        lines, roads = DRIVEN[name].lanes, roads_from_tracks(DRIVEN[name].tracks)
+        reached = roads_reached(roads, roads_lane_at(roads, lines[begin][5]))
+        for end in ends:
+            assert roads_lane_at(roads, lines[end][-5]).id in reached, (name, end)
+
+
+def roads_lane_at(roads, place):
+    return min(roads.lanes, key=lambda lane: KDTree(lane.centre).query(place)[0])
+
+
+def roads_reached(roads, lane):
+    by_id, found, todo = {x.id: x for x in roads.lanes}, set(), [lane.id]
+    while todo:
+        name = todo.pop()
+        if name not in found:
+            found.add(name)
+            todo += by_id[name].successors
+    return found
+
+
+def test_lane_numbers_of_the_log_name_the_lanes():
+    driven = highway(2, share=0.0, lanes=3, minutes=3.0)
+    tracks = [t for t in driven.tracks if t.id not in driven.changes]
+    lines = [KDTree(driven.lanes[str(n)]) for n in range(3)]
+    labels = [
+        np.argmin([line.query(np.stack([t.x, t.y], 1))[0] for line in lines], axis=0)
+        for t in tracks
+    ]
+    names = [np.array(["5", "7", "9"])[label] for label in labels]
+    roads = roads_from_tracks(tracks, labels=names)
+    assert {lane.id.partition(".")[0] for lane in roads.lanes} == {"5", "7", "9"}
+
+
+def test_few_positions_make_few_lanes_or_none():
+    assert roads_from_tracks([]).lanes == ()
+    still = highway(minutes=0.2).tracks[0]
+    stands = dataclasses.replace(still, x=0.0 * still.x, y=0.0 * still.y)
+    assert roads_from_tracks([stands]).lanes == ()
+    one = roads_from_tracks([still])
+    assert len({lane.id.partition(".")[0] for lane in one.lanes}) == 1

@@ -1,0 +1,174 @@
+"""Roads that are known, and noisy drives on them: what an estimate is compared with."""
+
+import dataclasses
+
+import numpy as np
+
+from rcirl_jax.types import Kind, Track
+
+
+@dataclasses.dataclass
+class Driven:
+    """Tracks, the true middle of each lane [m, 2] m, and who changes lanes."""
+
+    tracks: list
+    lanes: dict
+    changes: list = dataclasses.field(default_factory=list)
+
+
+def curve(s, kappa, start=(0.0, 0.0), heading=0.0):
+    """Points [n, 2] m and headings [n] rad along a curvature kappa(s) 1/m."""
+    h = heading + np.append(0.0, np.cumsum(0.5 * (kappa[1:] + kappa[:-1]) * np.diff(s)))
+    middle = 0.5 * (h[1:] + h[:-1])
+    steps = np.stack([np.cos(middle), np.sin(middle)], axis=1) * np.diff(s)[:, None]
+    return np.array(start) + np.vstack([[0.0, 0.0], np.cumsum(steps, axis=0)]), h
+
+
+def beside(points, heading, left):
+    """Points moved to the left, m."""
+    return points + np.stack([-np.sin(heading), np.cos(heading)], axis=1) * np.reshape(
+        np.broadcast_to(left, heading.shape), (-1, 1)
+    )
+
+
+def ramp(s, begin, length):
+    """0 before, 1 after, smooth between."""
+    u = np.clip((s - begin) / length, 0.0, 1.0)
+    return u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
+
+
+def drive(rng, name, road, left_of, speed, start, *, rate=12.5, noise=0.15):
+    """One car on a road (points, heading every metre), as a camera sees it.
+
+    Args:
+      rng: random numbers.
+      name: of the track.
+      road: points [n, 2] and headings [n], one a metre.
+      left_of: stations [m] -> m to the left of the road's line.
+      speed: m/s in the mean.
+      start: s.
+      rate: 1/s.
+      noise: m, of each position.
+    """
+    points, heading = road
+    count = int((len(points) - 1) / speed * rate)
+    t = start + (np.arange(count) + rng.uniform(-0.1, 0.1, count)) / rate
+    gone = t - start
+    station = np.arange(len(points))
+    s = np.clip(speed * gone + 3.0 * np.sin(0.1 * gone), 0.0, station[-1])
+    sway = rng.uniform(0.0, 0.25) * np.sin(
+        s / rng.uniform(60.0, 150.0) + rng.uniform(0.0, 6.0)
+    )
+    left = left_of(s) + rng.normal(0.0, 0.15) + sway
+    h = np.interp(s, station, heading)
+    x = np.interp(s, station, points[:, 0]) - left * np.sin(h)
+    y = np.interp(s, station, points[:, 1]) + left * np.cos(h)
+    return Track(
+        id=name,
+        kind=Kind.VEHICLE,
+        length=4.5,
+        width=1.9,
+        t=t,
+        x=x + rng.normal(0.0, noise, count),
+        y=y + rng.normal(0.0, noise, count),
+        heading=np.arctan2(np.sin(h), np.cos(h)),
+        speed=np.full(count, speed),
+    )
+
+
+def highway(seed=0, *, minutes=6.0, lanes=2, width=3.6, share=0.14, noise=0.15):
+    """A curve of 400 m radius, and a slip road whose drivers merge from the right.
+
+    Args:
+      seed: of the traffic.
+      minutes: of traffic.
+      lanes: beside the slip road.
+      width: m of each.
+      share: of drivers who change lanes.
+      noise: m, of positions.
+    """
+    rng, s = np.random.default_rng(seed), np.arange(501.0)
+    kappa = np.where((s > 150.0) & (s < 330.0), 1.0 / 400.0, 0.0)
+    road = curve(s, np.convolve(kappa, np.ones(40) / 40.0, "same"), (50.0, -30.0), 0.6)
+    slip = -width - 35.0 * np.maximum((180.0 - s) / 180.0, 0.0) ** 2
+    found = Driven([], {f"{n}": beside(*road, n * width) for n in range(lanes)})
+    found.lanes["slip"] = beside(*road, slip)[:270]  # many still drive on it there
+
+    def add(speed, start, left_of):
+        name = str(len(found.tracks))
+        options = {"noise": noise}
+        found.tracks.append(drive(rng, name, road, left_of, speed, start, **options))
+
+    for lane in range(lanes):
+        start = rng.uniform(0.0, 5.0)
+        while start < 60.0 * minutes:
+            speed, other = rng.uniform(20.0, 28.0), lane
+            if rng.random() < share and lanes > 1:
+                other = lane + (1 if lane == 0 else -1)
+                found.changes.append(str(len(found.tracks)))
+            begin, length = rng.uniform(60.0, 300.0), speed * rng.uniform(4.0, 7.0)
+            add(
+                speed,
+                start,
+                lambda s, a=lane, b=other, at=begin, n=length: (
+                    width * (a + (b - a) * ramp(s, at, n))
+                ),
+            )
+            start += rng.exponential(5.0) + 1.5
+    start = rng.uniform(0.0, 8.0)
+    while start < 60.0 * minutes:
+        speed, begin = rng.uniform(16.0, 22.0), rng.uniform(190.0, 290.0)
+        found.changes.append(str(len(found.tracks)))
+        add(
+            speed,
+            start,
+            lambda x, at=begin, n=4.0 * speed: (
+                np.interp(x, s, slip) + width * ramp(x, at, n)
+            ),
+        )
+        start += rng.exponential(15.0) + 2.0
+    return found
+
+
+def country_road(seed=0, *, minutes=5.0, radius=60.0, width=3.4):
+    """A lane each way through a tight S."""
+    rng, s = np.random.default_rng(seed), np.arange(401.0)
+    kappa = np.where((s > 80.0) & (s < 180.0), 1.0, 0.0)
+    kappa -= np.where((s > 220.0) & (s < 320.0), 1.0, 0.0)
+    points, heading = curve(s, np.convolve(kappa / radius, np.ones(20) / 20.0, "same"))
+    roads = {"ahead": (points, heading), "back": (points[::-1], heading[::-1] + np.pi)}
+    found = Driven([], {n: beside(*road, -0.5 * width) for n, road in roads.items()})
+    for road in roads.values():
+        start = 0.0
+        while start < 60.0 * minutes:
+            made = (rng, str(len(found.tracks)), road, lambda x: 0.0 * x - 0.5 * width)
+            found.tracks.append(drive(*made, rng.uniform(11.0, 17.0), start))
+            start += rng.exponential(8.0) + 2.0
+    return found
+
+
+def crossing(seed=0, *, minutes=8.0, arm=60.0, width=3.5):
+    """Four arms with a lane each way: straight on, left and right from each."""
+    rng, found = np.random.default_rng(seed), Driven([], {})
+    for number in range(4):
+        for turn, sign, radius in (
+            ("on", 0, 1.0),
+            ("left", 1, 10.0),
+            ("right", -1, 6.0),
+        ):
+            bend = arm + 0.5 * sign * width - radius if sign else 2.0 * arm
+            arc = radius * np.pi / 2.0 if sign else 0.0
+            s = np.arange(0.0, (2.0 * bend + arc if sign else 2.0 * arm), 0.1)
+            kappa = np.where((s >= bend) & (s < bend + arc), sign / radius, 0.0)
+            points, heading = curve(s, kappa, (-arm, -0.5 * width))
+            turned = 0.5 * np.pi * number
+            c, sn = np.cos(turned), np.sin(turned)
+            points = points @ np.array([[c, sn], [-sn, c]])
+            road = points[::10], heading[::10] + turned
+            found.lanes[f"{number} {turn}"] = road[0]
+            start = rng.uniform(0.0, 10.0)
+            while start < 60.0 * minutes:
+                made = (rng, str(len(found.tracks)), road, lambda x: 0.0 * x)
+                found.tracks.append(drive(*made, rng.uniform(6.0, 11.0), start))
+                start += rng.exponential(20.0) + 2.0
+    return found
