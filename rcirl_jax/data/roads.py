@@ -430,6 +430,20 @@ def _votes(
     return int(np.bincount(went).argmax())
 
 
+def _beyond_a_gap(ridges: Sequence[_Ridge], number: int) -> int:
+    """Returns the ridge that begins straight ahead of a ridge's end; -1: none."""
+    line = ridges[number].line
+    way = _ways(line)[-1]
+    for other, ridge in enumerate(ridges):
+        gap = ridge.line[0] - line[-1]
+        along, across = float(gap @ way), float(_cross(way, gap))
+        turned = float(_ways(ridge.line)[0] @ way)
+        is_ahead = 0.0 < along < TAPER_M and abs(across) < JOIN_M + 0.05 * along
+        if other != number and is_ahead and turned > np.cos(0.1):
+            return other
+    return -1
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Beside:
     """The ridges beside each point of one, to the left and to the right."""
@@ -642,6 +656,8 @@ def roads_from_tracks(
             other, blend = ridge.ends[is_end], BLEND_M
             if other < 0:
                 other, blend = _votes(ridges, number, is_end, samples, on), TAPER_M
+            if other < 0 and is_end:
+                other = _beyond_a_gap(ridges, number)
             if other == number:  # a circle
                 at = 0 if is_end else len(ridge.line) - 1
                 links.append(_Link(ridge=number, is_end=is_end, other=number, at=at))
