@@ -27,7 +27,7 @@ _RUN = flags.DEFINE_string(
 _OUTPUT = flags.DEFINE_string("output", None, "a copy of RUN/report.html to write")
 
 # what is noted of a run and is not set again
-NOT_OF_A_RUN = ("output", "executor", "workers", "ray_address")
+NOT_OF_A_RUN = (*("output", "executor", "workers", "ray_address", "compilation_cache"),)
 
 
 def recall(folder: Path) -> None:

@@ -28,6 +28,7 @@ from rcirl_jax.export.reader import load_weights
 from rcirl_jax.runtime import provenance as made_by
 from rcirl_jax.runtime import signals as interrupts
 from rcirl_jax.runtime.atomic_files import is_text
+from rcirl_jax.runtime.compiling import use_cache
 
 EXIT_BAD_INPUT = 2
 EXIT_FAULT = 70  # of this program, as sysexits.h has it
@@ -53,6 +54,11 @@ FULL = ("-helpfull", "--helpfull")
 WIDTH, INDENT = 100, 20  # columns of help
 LONGEST = 40  # characters of a default
 FROM_FILE = "--flagfile=FILE reads flags from a file, one a line."
+_CACHE = flags.DEFINE_bool(
+    "compilation_cache",
+    True,
+    "keep compiled programs in the user's folder of caches, 2 GiB at most",
+)
 
 
 def run(main: Callable[[], None]) -> None:
@@ -68,6 +74,8 @@ def run(main: Callable[[], None]) -> None:
     def guarded(argv: list[str]) -> None:
         try:
             _take(argv[1:], main)
+            if _CACHE.value:
+                use_cache()
             main()
         except InputError as error:
             _refuse(with_flags(str(error)))

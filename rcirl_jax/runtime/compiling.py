@@ -1,9 +1,11 @@
-"""How XLA compiles long loops on a CPU, how long it takes, and a bar that says so."""
+"""How XLA compiles long loops on a CPU, how long it takes, and where it is kept."""
 
 import contextlib
 import functools
+import os
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import jax
 import tqdm
@@ -28,6 +30,40 @@ def wide_vectors() -> dict[str, int] | None:
     except (jax.errors.JaxRuntimeError, ValueError):  # "No such compile option"
         return None
     return WIDE
+
+
+CACHE_BYTES = 2 * 2**30  # of compiled programs that are kept
+
+
+def use_cache(most: int = CACHE_BYTES) -> Path | None:
+    """Keeps compiled programs from process to process, in JAX's compilation cache.
+
+    The folder is that of JAX_COMPILATION_CACHE_DIR, which is then the user's own affair,
+    or rcirl-jax in the user's folder of caches. Of the latter the oldest programs are
+    removed until the others take `most` bytes. Workers keep theirs in it too.
+
+    Returns:
+      The folder; None where it cannot be written: nothing is kept then.
+    """
+    if given := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        return Path(given)
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(home) / "rcirl-jax"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        files = [(x.stat().st_mtime, x.stat().st_size, x) for x in folder.iterdir()]
+        kept = 0
+        for _, size, file in sorted(files, reverse=True):
+            kept += size
+            if kept > most:
+                file.unlink(missing_ok=True)
+        if not os.access(folder, os.W_OK):
+            return None
+    except (OSError, RuntimeError):  # no home
+        return None
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)  # of workers
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    return folder
 
 
 @contextlib.contextmanager

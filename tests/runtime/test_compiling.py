@@ -1,13 +1,14 @@
 """Seconds of compilations, of all programs or one; a bar that says why it waits."""
 
 import io
+import os
 
 import jax
 import jax.numpy as jnp
 import pytest
 
 from rcirl_jax.runtime import compiling
-from rcirl_jax.runtime.compiling import NOTE, CompilesFirst, compiles
+from rcirl_jax.runtime.compiling import NOTE, CompilesFirst, compiles, use_cache
 
 
 def test_compilations_are_heard_inside_the_block_only():
@@ -62,3 +63,26 @@ def test_the_note_goes_with_the_first_update():
         bar.set_postfix_str("loss=1")
         bar.update()
     assert "loss=1" in said.getvalue().split("\r")[-1]
+
+
+def test_the_cache_is_bounded_the_users_own_and_known_to_workers(tmp_path, monkeypatch):
+    before = jax.config.jax_compilation_cache_dir
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/given")
+    assert str(use_cache()) == "/given"
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    own = tmp_path / "rcirl-jax"
+    own.mkdir()
+    for age in range(4):
+        (own / f"program{age}").write_bytes(bytes(10))
+        os.utime(own / f"program{age}", (1000 - age, 1000 - age))
+    try:
+        assert use_cache(most=25) == own
+        assert jax.config.jax_compilation_cache_dir == str(own)
+        assert os.environ["JAX_COMPILATION_CACHE_DIR"] == str(own)
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+    assert sorted(x.name for x in own.iterdir()) == ["program0", "program1"]
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(own / "program0"))  # no folder
+    assert use_cache() is None
