@@ -515,15 +515,31 @@ def _pieces(
       width: m, where no lane is beside.
       limit: m/s, or None.
     """
-    cuts: list[list[int]] = []  # of each ridge, its first and last point among them
+    last = [len(ridge.line) - 1 for ridge in ridges]
+    fixed = [
+        {link.at for link in links if link.other == n} | {0, end}
+        for n, end in enumerate(last)
+    ]
+
+    def cut(number: int, at: int) -> None:
+        """Cuts a ridge unless it is cut near there, and those beside it likewise."""
+        if min(abs(at - x) for x in fixed[number]) * STEP_M >= MIN_PIECE_M:
+            fixed[number].add(at)
+            beside_too(number, at)
+
+    def beside_too(number: int, at: int) -> None:
+        own = beside[number]
+        for other, point in zip(own.ridge[:, at], own.point[:, at], strict=True):
+            if other >= 0:
+                cut(int(other), int(point))
+
     for number, ridge in enumerate(ridges):
-        last = len(ridge.line) - 1
-        fixed = {link.at for link in links if link.other == number} | {0, last}
-        steps = range(0, last, round(PIECE_M / STEP_M))
+        for at in sorted(fixed[number] - {0, last[number]}):
+            beside_too(number, at)
+        steps = range(0, last[number], round(PIECE_M / STEP_M))
         for at in [*_changes(beside[number]), *steps]:
-            if min(abs(at - x) for x in fixed) * STEP_M >= MIN_PIECE_M:
-                fixed.add(at)
-        cuts.append(sorted(fixed))
+            cut(number, at)
+    cuts = [sorted(some) for some in fixed]
 
     def name(number: int, piece: int) -> str:
         only = len(cuts[number]) == 2
