@@ -4,6 +4,7 @@ A dataset holds scenes along drivers' own ways. Whether the roads under them are
 is seen on a plan alone: lanes, directions, limits, stop lines, and where cars drove.
 """
 
+import itertools
 from collections.abc import Mapping
 from typing import Any
 
@@ -75,7 +76,7 @@ def changes_of_lane(track: Track, graph: LaneGraph) -> list[list[float]]:
     names = graph.match(track.x, track.y, track.heading)
     runs = [0, *(np.flatnonzero(names[1:] != names[:-1]) + 1).tolist(), len(names)]
     found, before = [], ""
-    for first, last in zip(runs, runs[1:], strict=False):
+    for first, last in itertools.pairwise(runs):
         name = str(names[first])
         if not name or track.t[last - 1] - track.t[first] < STAYS_S:
             continue

@@ -11,6 +11,7 @@ ends, the lane on which its drivers go on is its successor.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -79,6 +80,7 @@ class _Ridge:
     """A traced lane, points every STEP_M or so in driving direction."""
 
     name: str
+    label: str  # of the samples that it is made of, "": all
     line: np.ndarray  # [m, 2] m
     # number of the ridge that its first, last point joins; -1: none
     ends: list[int]
@@ -122,7 +124,7 @@ def _thinned(track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     step = float(np.median(np.diff(track.t)))
     window = min(max(round(SMOOTH_S / step), 5), len(points))
     window -= 1 - window % 2
-    smooth = savgol_filter(points, window, 2, axis=0)
+    smooth = np.asarray(savgol_filter(points, window, 2, axis=0))
     moves = np.hypot(*np.diff(smooth, axis=0).T) * (track.speed[1:] > MOVING_MPS)
     arc = np.append(0.0, np.cumsum(moves))
     if arc[-1] < 3.0 * STEP_M:
@@ -149,22 +151,27 @@ class _Tracer:
         self.points, self.ways = np.zeros((0, 2)), np.zeros((0, 2))
         self.owner = np.zeros(0, int)  # ridge of each point
 
-    def nearest(self, place: np.ndarray, way: np.ndarray) -> tuple[int, float]:
+    def nearest(
+        self, place: np.ndarray, way: np.ndarray, label: str
+    ) -> tuple[int, float]:
         """Returns the ridge nearest to a place, the same way, and how far it is, m."""
         if not len(self.points):
             return -1, np.inf
         apart = np.hypot(*(self.points - place).T)
         apart = np.where(self.ways @ way > SAME_WAY, apart, np.inf)
+        if label:
+            own = np.array([ridge.label == label for ridge in self.ridges])
+            apart = np.where(own[self.owner], apart, np.inf)
         n = int(np.argmin(apart))
         return int(self.owner[n]), float(apart[n])
 
     def settled(
         self, place: np.ndarray, way: np.ndarray, label: str, rounds: int = 1
     ) -> tuple[np.ndarray, np.ndarray, int]:
-        """Moves a place across the way to the ridge; returns it, the way, and tracks."""
+        """Moves a place across to the ridge; returns it, the way, and tracks."""
         number = 0
         for _ in range(rounds):
-            near, along, left = self.samples.around(place, way, label)
+            near, _along, left = self.samples.around(place, way, label)
             number = np.unique(self.samples.track[near]).size
             if number < self.fewest:
                 return place, way, number
@@ -191,8 +198,8 @@ class _Tracer:
             place, way, number = self.settled(place + sense * STEP_M * way, way, label)
             if number < self.fewest:
                 return points, counts, -1
-            joined, apart = self.nearest(place, way)
-            if not label and apart < JOIN_M:
+            joined, apart = self.nearest(place, way, label)
+            if apart < JOIN_M:
                 return points, counts, joined
             if len(points) > 20 and np.hypot(*(place - begin)) < STEP_M:
                 return points, counts, len(self.ridges)  # a circle closes
@@ -205,7 +212,7 @@ class _Tracer:
         place, way, number = self.settled(place, way, label, 8)
         if number < self.fewest:
             return False
-        if not label and self.nearest(place, way)[1] < COVERED * self.width:
+        if self.nearest(place, way, label)[1] < COVERED * self.width:
             return False
         own = len(self.ridges)
         ahead, after, last = self.trace(place, way, label, 1.0)
@@ -215,14 +222,17 @@ class _Tracer:
         line = np.array([*back[::-1], place, *ahead])
         if (len(line) - 1) * STEP_M < SHORTEST_M[(first >= 0) + (last >= 0)]:
             return False
-        if not label and len(self.points):
-            ways = _ways(line)
-            apart = [self.nearest(p, w)[1] for p, w in zip(line, ways, strict=True)]
+        if len(self.points):
+            pairs = zip(line, _ways(line), strict=True)
+            apart = [self.nearest(*pair, label)[1] for pair in pairs]
             if np.median(apart) < 0.65 * self.width:
                 return False
-        name = label or f"lane-{len(self.ridges)}"
+        again = sum(ridge.label == label for ridge in self.ridges)
+        name = label + (f"-{again}" if again else "") if label else f"lane-{again}"
         support = float(np.median([*before, number, *after]))
-        ridge = _Ridge(name=name, line=line, ends=[first, last], support=support)
+        ridge = _Ridge(
+            name=name, label=label, line=line, ends=[first, last], support=support
+        )
         self.ridges.append(ridge)
         self.points = np.concatenate([self.points, line])
         self.ways = np.concatenate([self.ways, _ways(line)])
@@ -255,16 +265,21 @@ class _Tracer:
             open_[inside] = False
             if added:
                 line = self.ridges[-1].line
-                ways = _ways(line)
-                reach = COVERED * self.width
-                apart, at = KDTree(line).query(
-                    samples.place, distance_upper_bound=reach
-                )
+                apart, at = _query(line, samples.place, COVERED * self.width)
                 near = np.flatnonzero(np.isfinite(apart))
-                same = np.sum(ways[at[near]] * samples.way[near], axis=1) > SAME_WAY
-                if label := self.ridges[-1].name if samples.label[inside[0]] else "":
+                same = np.sum(_ways(line)[at[near]] * samples.way[near], axis=1)
+                same = same > SAME_WAY
+                if label := self.ridges[-1].label:
                     same &= samples.label[near] == label
                 open_[near[same]] = False
+
+
+def _query(
+    line: np.ndarray, places: np.ndarray, reach: float = np.inf
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns how far m each place is from a line's points, and which is nearest."""
+    apart, at = KDTree(line).query(places, distance_upper_bound=reach)
+    return np.asarray(apart), np.asarray(at)
 
 
 def _ways(line: np.ndarray) -> np.ndarray:
@@ -290,7 +305,7 @@ def _evenly(line: np.ndarray, step: float = STEP_M) -> np.ndarray:
 
 def _left_of(line: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the nearest point's number and m to the left of it, by place."""
-    at = KDTree(line).query(places)[1]
+    at = _query(line, places)[1]
     ways = _ways(line)[at]
     gap = places - line[at]
     return at, ways[:, 0] * gap[:, 1] - ways[:, 1] * gap[:, 0]
@@ -318,17 +333,15 @@ def _refined(ridge: _Ridge, samples: _Samples) -> None:
     """Moves a ridge to the median of the positions of those who drive along it."""
     for _ in range(2):
         line = _evenly(ridge.line)
-        apart, at = KDTree(line).query(
-            samples.place, distance_upper_bound=2.0 * REACH_M
-        )
+        apart, at = _query(line, samples.place, 2.0 * REACH_M)
         near = np.flatnonzero(np.isfinite(apart))
         ways, at = _ways(line), at[near]
         gap, way = samples.place[near] - line[at], ways[at]
         left = way[:, 0] * gap[:, 1] - way[:, 1] * gap[:, 0]
         along = np.sum(way * samples.way[near], axis=1)
         kept = (np.abs(left) < REACH_M) & (along > np.cos(np.deg2rad(6.0)))
-        if samples.label[near].any():
-            kept &= samples.label[near] == ridge.name
+        if ridge.label:
+            kept &= samples.label[near] == ridge.label
         at, left = at[kept], left[kept]
         order = np.argsort(at, kind="stable")
         at, left = at[order], left[order]
@@ -387,7 +400,7 @@ def _led_onto(
 def _on(
     ridges: Sequence[_Ridge], samples: _Samples, width: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the ridge [n] that each sample is on, -1 for none, and its point there."""
+    """Returns the ridge [n] that each sample is on, -1: none, and its point there."""
     points = np.concatenate([ridge.line for ridge in ridges])
     ways = np.concatenate([_ways(ridge.line) for ridge in ridges])
     sizes = [len(ridge.line) for ridge in ridges]
@@ -455,17 +468,15 @@ class _Beside:
 
 def _beside(ridges: Sequence[_Ridge], width: float) -> list[_Beside]:
     """Returns the neighbours of every ridge: the same way, a width apart or so."""
-    trees = [KDTree(ridge.line) for ridge in ridges]
     found = []
     for number, ridge in enumerate(ridges):
         ways, size = _ways(ridge.line), len(ridge.line)
         names, points = np.full((2, size), -1), np.zeros((2, size), int)
         apart = np.full((2, size), np.inf)
-        for other, tree in enumerate(trees):
+        for other, their in enumerate(ridges):
             if other == number:
                 continue
-            reach = 1.6 * width
-            gap, at = tree.query(ridge.line, distance_upper_bound=reach)
+            gap, at = _query(their.line, ridge.line, 1.6 * width)
             near = np.flatnonzero((gap > 0.6 * width) & np.isfinite(gap))
             if not near.size:
                 continue
@@ -492,10 +503,10 @@ def _changes(beside: _Beside) -> list[int]:
         # a neighbour lost for less than MIN_PIECE_M is not lost
         long = [
             (a, names[a])
-            for a, b in zip(runs, runs[1:], strict=False)
+            for a, b in itertools.pairwise(runs)
             if (b - a) * STEP_M >= MIN_PIECE_M
         ]
-        found += [a for (_, x), (a, y) in zip(long, long[1:], strict=False) if x != y]
+        found += [a for (_, x), (a, y) in itertools.pairwise(long) if x != y]
     return found
 
 
@@ -533,7 +544,7 @@ def _pieces(
             if other >= 0:
                 cut(int(other), int(point))
 
-    for number, ridge in enumerate(ridges):
+    for number in range(len(ridges)):
         for at in sorted(fixed[number] - {0, last[number]}):
             beside_too(number, at)
         steps = range(0, last[number], round(PIECE_M / STEP_M))
@@ -555,7 +566,7 @@ def _pieces(
         gaps = np.where(np.isfinite(own.apart), own.apart, width)
         half = 0.5 * np.stack([gaussian_filter1d(x, 5.0, mode="nearest") for x in gaps])
         mine = cuts[number]
-        for piece, (a, b) in enumerate(zip(mine, mine[1:], strict=False)):
+        for piece, (a, b) in enumerate(itertools.pairwise(mine)):
             successors = [name(number, piece + 1)] if b != mine[-1] else []
             for link in links:
                 if link.is_end and link.ridge == number and b == mine[-1]:

@@ -1,4 +1,4 @@
-"""The plan of a site: lanes with their directions, and where and how fast cars drove."""
+"""The plan of a site: lanes, their directions, and where and how fast cars drove."""
 
 import io
 from collections.abc import Mapping

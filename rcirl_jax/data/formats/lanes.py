@@ -1,9 +1,7 @@
-"""Lanes of logs without a map: the source TOML's, straight ones, or paths driven.
+"""Lanes of logs without a map: the source TOML's, or straight ones.
 
-Straight lanes are parallel to the x axis, one for each lane number. Else the longest
-paths become lanes; whoever drives within a lane's width of one, the same way, is on it.
-Long drives are cut into pieces that follow each other, and a piece that meets the start
-of another ends there: a lap closes.
+Straight lanes are parallel to the x axis, one for each lane number. `data.roads` finds
+the others in the tracks.
 """
 
 import dataclasses
@@ -17,17 +15,11 @@ from rcirl_jax.data.readers.tables.rows import RowStats
 from rcirl_jax.data.readers.tables.table import fields_of, open_table, read
 from rcirl_jax.data.recording import check_lanes_length, check_span
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Lane, Track
+from rcirl_jax.types import Lane
 
 LANE_WIDTH_M = 3.5  # m, where nobody says it
 LANE_STEP_M = 5.0  # m between points of a fitted lane
 NEIGHBOUR_WIDTHS = 1.6  # lane widths between centres up to which lanes adjoin
-PIECE_M = 400.0  # m, longest lane along a path
-EXTRA_M = 20.0  # m of lane beyond both ends of a path
-MAX_PATHS = 200  # longest tracks tried as lanes
-MOVING_MPS = 0.5  # m/s; below it positions only jitter
-MIN_POINTS = 3  # points of the shortest lane
-MIN_ALIGNED = 0.7  # cosine of the largest angle between a path and its lane
 SIDES = ("left", "right")
 COLUMNS = {"id": "text", "x": "number", "y": "number"}  # of a table of lanes
 OPTIONAL = {
@@ -195,114 +187,3 @@ def parallel_lane(
         left=beside[0],
         right=beside[1],
     )
-
-
-def path_lanes(
-    tracks: Sequence[Track], width: float, limit: float | None
-) -> tuple[Lane, ...]:
-    """Returns lanes along the paths of the longest vehicle tracks.
-
-    Args:
-      tracks: road users; others than vehicles make no lanes.
-      width: m, of every lane; nobody has measured it.
-      limit: m/s, or None.
-    """
-    vehicles = [track for track in tracks if track.kind == Kind.VEHICLE]
-    vehicles.sort(key=lambda track: -np.hypot(np.ptp(track.x), np.ptp(track.y)))
-    fitted = _Fitted(width)
-    for track in vehicles[:MAX_PATHS]:
-        points = _thin(track)
-        if len(points) >= MIN_POINTS:
-            fitted.add(points)
-    lanes = []
-    for place, line in enumerate(fitted.lines):
-        half = np.full(len(line), 0.5 * width)
-        after = [fitted.after[place]] if place in fitted.after else []
-        lane = Lane(
-            id=f"path-{place}",
-            centre=line,
-            left_width=half,
-            right_width=half,
-            speed_limit=limit,
-            width_assumed=True,
-            successors=tuple(f"path-{other}" for other in after),
-        )
-        lanes.append(lane)
-    return tuple(lanes)
-
-
-def _thin(track: Track) -> np.ndarray:
-    """[n, 2] m, a point per step of the path; standing still adds none.
-
-    Both ends are continued straight, so that nobody ends at a lane's very end.
-    """
-    points = np.stack([track.x, track.y], axis=1)
-    steps = np.hypot(*np.diff(points, axis=0).T) * (track.speed[1:] > MOVING_MPS)
-    arc = np.concatenate([[0.0], np.cumsum(steps)])
-    kept = points[np.unique(arc // LANE_STEP_M, return_index=True)[1]]
-    if len(kept) < MIN_POINTS:
-        return kept
-    ends = []
-    for near, far, end in (
-        (kept[0], kept[2], points[0]),
-        (kept[-1], kept[-3], points[-1]),
-    ):
-        out = (near - far) / max(float(np.hypot(*(near - far))), 1e-9)
-        ends.append(end + EXTRA_M * out)
-    return np.concatenate([ends[:1], kept, ends[1:]])
-
-
-def _ways(points: np.ndarray) -> np.ndarray:
-    """Unit vectors [n, 2] along a path."""
-    step = np.gradient(points, axis=0)
-    return step / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
-
-
-class _Fitted:
-    """Centre lines so far, in order; their points with directions; which follows."""
-
-    def __init__(self, width: float) -> None:
-        self.width = width
-        self.lines: list[np.ndarray] = []
-        self.after: dict[int, int] = {}  # number of a line -> of the next one
-        self.points, self.ways = np.zeros((0, 2)), np.zeros((0, 2))
-
-    def add(self, points: np.ndarray) -> None:
-        """Appends the uncovered stretches of a path as successive lanes."""
-        ways, size = _ways(points), int(PIECE_M / LANE_STEP_M)
-        first, before = 0, -1  # first point of the piece; lane it continues
-        while first + MIN_POINTS <= len(points):
-            last = min(first + size, len(points))
-            if len(points) - last < MIN_POINTS:
-                last = len(points)
-            # [n, m] whether point n is near lane point m, and heads the same way
-            piece = points[first:last]
-            low, high = piece.min(axis=0) - self.width, piece.max(axis=0) + self.width
-            near = np.all((self.points >= low) & (self.points <= high), axis=1)
-            gap = piece[:, None] - self.points[None, near]
-            known = np.zeros((len(piece), len(near)), bool)
-            known[:, near] = ways[first:last] @ self.ways[near].T > MIN_ALIGNED
-            known[:, near] &= np.hypot(gap[..., 0], gap[..., 1]) < self.width
-            if known.any(axis=1).mean() > 0.5:
-                first, before = last - 1, -1
-                continue
-            starts = np.cumsum([0, *map(len, self.lines)])[:-1]
-            met = known[:, starts]
-            met[:MIN_POINTS] = False
-            rows, meets = np.flatnonzero(met.any(axis=1)), -1
-            if rows.size:
-                last = first + int(rows[0])
-                meets = int(np.flatnonzero(met[rows[0]])[0])
-            line = points[first:last]
-            number = len(self.lines)
-            if before >= 0:
-                self.after[before] = number
-            if meets >= 0:
-                line = np.concatenate([line, self.lines[meets][:1]])
-                self.after[number] = meets
-            self.lines.append(line)
-            self.points = np.concatenate([self.points, line])
-            self.ways = np.concatenate([self.ways, _ways(line)])
-            first, before = last - 1, -1 if meets >= 0 else number
-            if last == len(points):
-                break

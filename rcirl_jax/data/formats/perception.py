@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.formats.lanes import path_lanes
 from rcirl_jax.data.formats.options import USER_KEYS, number, positive, section, stated
 from rcirl_jax.data.formats.shapes import local_origin
 from rcirl_jax.data.formats.tracks import once_each, split_tracks
 from rcirl_jax.data.recording import LENGTH_RANGE_M, MAX_SPEED_MPS, WIDTH_RANGE_M
+from rcirl_jax.data.roads import WIDTH_M, roads_from_tracks
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Signal, Track
 
@@ -25,7 +25,6 @@ UNKNOWN_CHOICES = ("auto", "drop", "static", "vehicle")
 STANDING_M = 1.0  # m, an unknown object that moves less than this is static
 MAX_OUTLIERS = 0.1  # share of tracks dropped as outliers; more is an error
 ONE_OF = 5  # tracks of which one may always be an outlier
-LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
 # m, [length, width] of road users of which none is known; others: 1 m
 SIZES_M = {
     Kind.VEHICLE: (4.5, 1.8),
@@ -272,13 +271,13 @@ def placed(
 def fitted_lanes(
     tracks: Sequence[Track], spec: Mapping
 ) -> tuple[tuple[Lane, ...], str]:
-    """Fits lanes to the paths that were driven, with a note of their number.
+    """Estimates lanes from all tracks, with a note on them.
 
     Their limit is what the user's own TOML states, if it does.
     """
-    width = positive(spec, "lane_width_m", LANE_WIDTH_M)
-    lanes = path_lanes(tracks, width, stated(spec, "speed_limit"))
-    return lanes, f"{len(lanes)} lanes fitted to the longest paths"
+    width = positive(spec, "lane_width_m", WIDTH_M)
+    roads = roads_from_tracks(tracks, width=width, limit=stated(spec, "speed_limit"))
+    return roads.lanes, roads.note
 
 
 def held_states(

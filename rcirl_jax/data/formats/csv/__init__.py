@@ -15,8 +15,11 @@ FORMAT = Format(
             },
             {"file": "lanes.csv"},
         ],
+        "missing": [
+            {"t": [0.0, 8.0], "x": [0.0, 99.0], "y": [0.0, 0.0], "recording": "d"}
+        ],
         "defaults": {"rate_hz": 10.0, "length": 4.5, "width": 1.8, "kind": "vehicle"},
     },
     free=("columns", "units", "scale", "offset", "kinds", "table"),
-    checked=("pattern", "lanes"),
+    checked=("pattern", "lanes", "missing"),
 )

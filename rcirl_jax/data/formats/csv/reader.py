@@ -8,9 +8,10 @@ in float32 later.
 import collections
 import dataclasses
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from rcirl_jax.data.formats.csv.columns import (
@@ -32,7 +33,6 @@ from rcirl_jax.data.formats.lanes import (
     StraightLane,
     lane_file_of,
     lanes_of_toml,
-    path_lanes,
     straight_lanes,
 )
 from rcirl_jax.data.formats.options import (
@@ -49,8 +49,10 @@ from rcirl_jax.data.readers.long_logs import rows_of
 from rcirl_jax.data.readers.tables.rows import Rows, RowStats, attach_row_stats
 from rcirl_jax.data.readers.tables.table import Table
 from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.roads import roads_from_tracks
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Lane, Recording, Track
+from rcirl_jax.runtime.checked import checked
+from rcirl_jax.types import Kind, Lane, MissingAgent, Recording, Track
 
 PATTERNS = (
     *("*.csv", "*.csv.gz", "*.csv.zst", "*.csv.bz2"),
@@ -130,7 +132,8 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
                 name = own if recording is None else f"{own}-{recording}"
                 for part in rows.slices(recording, MAX_GAP_STEPS / columns.rate_hz):
                     values = meaning.applied(log.placed(part.values))
-                    made = _recording(f"{name}{part.label}", values, log, meaning)
+                    of = (values, log, meaning)
+                    made = _recording(f"{name}{part.label}", recording, *of)
                     made = attach_row_stats(part.of_log(name, made), log.stats)
                     yield validate_recording(made, file)
 
@@ -141,7 +144,9 @@ def opened(file: Path, spec: dict) -> Log:
     return Log(table=table, spec=spec, columns=columns_of(table, spec), stats=stats)
 
 
-def _recording(name: str, values: Rows, log: Log, meaning: Meaning) -> Recording:
+def _recording(
+    name: str, recording: str | None, values: Rows, log: Log, meaning: Meaning
+) -> Recording:
     path, spec, columns = log.table.path, log.spec, log.columns
     span = max(np.ptp(values["x"]), np.ptp(values["y"]))
     if not columns.has_units and 0.0 < span < STILL_M:
@@ -161,7 +166,9 @@ def _recording(name: str, values: Rows, log: Log, meaning: Meaning) -> Recording
         _track(label, {n: column[rows] for n, column in values.items()}, log, meaning)
         for label, rows in pieces
     )
-    lanes, notes = _lanes(values, tracks, log, origin)
+    numbers = values.get("lane")
+    labels = None if numbers is None else [numbers[rows] for _, rows in pieces]
+    lanes, notes = _lanes(values, tracks, labels, log, origin)
     return Recording(
         name=name,
         source=str(spec.get("source", "CSV log")),
@@ -169,8 +176,35 @@ def _recording(name: str, values: Rows, log: Log, meaning: Meaning) -> Recording
         rate_hz=columns.rate_hz,
         tracks=tracks,
         lanes=lanes,
+        missing_agents=_missing(spec, recording, origin),
         default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
         notes=(*columns.notes, *meaning.notes, *origin_notes(origin), *notes),
+    )
+
+
+class _Missing(msgspec.Struct, forbid_unknown_fields=True):
+    """[[missing]]: a vehicle that drove there and has no rows."""
+
+    t: tuple[float, float]  # s, as in the log
+    x: tuple[float, float]  # m, at both times, as in the log
+    y: tuple[float, float]
+    recording: str = ""  # a value of the `recording` column, "": every one
+
+
+def _missing(
+    spec: Mapping, recording: str | None, origin: np.ndarray
+) -> tuple[MissingAgent, ...]:
+    """Returns the vehicles that the TOML says are missing from a recording."""
+    every = checked(spec.get("missing", []), list[_Missing], "source TOML: missing")
+    return tuple(
+        MissingAgent(
+            t0=one.t[0],
+            t1=one.t[1],
+            start=(one.x[0] - origin[0], one.y[0] - origin[1]),
+            end=(one.x[1] - origin[0], one.y[1] - origin[1]),
+        )
+        for one in every
+        if one.recording in ("", recording)
     )
 
 
@@ -203,9 +237,13 @@ def _track(name: str, rows: Rows, log: Log, meaning: Meaning) -> Track:
 
 
 def _lanes(
-    values: Rows, tracks: tuple[Track, ...], log: Log, origin: np.ndarray
+    values: Rows,
+    tracks: tuple[Track, ...],
+    labels: list[np.ndarray] | None,
+    log: Log,
+    origin: np.ndarray,
 ) -> tuple[tuple[Lane, ...], list[str]]:
-    """The lanes given; else straight ones from the lane column; else paths."""
+    """The lanes given; else straight ones of the lane column; else by all tracks."""
     path, spec = log.table.path, log.spec
     given = lanes_of_toml(path, spec, lambda p: log.columns.metres(p) - origin)
     if given:
@@ -216,8 +254,8 @@ def _lanes(
     if found:
         lanes = straight_lanes(path, found, width, limit)
         return lanes, ["straight lanes fitted to the lane column"]
-    lanes = path_lanes(tracks, width, limit)
-    return lanes, [f"no lanes given; {len(lanes)} fitted to the longest paths"]
+    roads = roads_from_tracks(tracks, width=width, limit=limit, labels=labels)
+    return roads.lanes, [roads.note]
 
 
 def _straight(

@@ -24,7 +24,6 @@ import numpy as np
 from rcirl_jax.data.formats.declared import KINDS, open_log, track_of, unknown_kinds
 from rcirl_jax.data.formats.files import files_below, given_map, is_input, log_name
 from rcirl_jax.data.formats.lanelet2.map import read_lanelet2
-from rcirl_jax.data.formats.lanes import path_lanes
 from rcirl_jax.data.formats.options import number
 from rcirl_jax.data.formats.perception import SIZES_M
 from rcirl_jax.data.formats.projection import utm, utm_zone
@@ -39,6 +38,7 @@ from rcirl_jax.data.readers.tables.rows import (
 )
 from rcirl_jax.data.readers.tables.table import fields_of, open_table, read
 from rcirl_jax.data.recording import accepted, validate_recording
+from rcirl_jax.data.roads import roads_from_tracks
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Track
 
@@ -223,7 +223,7 @@ def _recording(name: str, rows: Rows, scene: _Scene, group: str | None) -> Recor
     )
     lanes = scene.lanes
     if lanes is None:
-        lanes = path_lanes(tracks, number(spec, "lane_width_m"), None)
+        lanes = roads_from_tracks(tracks, width=number(spec, "lane_width_m")).lanes
     kinds = set(np.unique(rows["agent_type"])) - {EITHER}
     return Recording(
         name=name,

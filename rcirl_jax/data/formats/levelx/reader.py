@@ -30,7 +30,7 @@ from rcirl_jax.data.formats.declared import (
 )
 from rcirl_jax.data.formats.files import files_below, given_map, log_name
 from rcirl_jax.data.formats.lanelet2.map import read_lanelet2
-from rcirl_jax.data.formats.lanes import StraightLane, parallel_lane, path_lanes
+from rcirl_jax.data.formats.lanes import StraightLane, parallel_lane
 from rcirl_jax.data.formats.options import number
 from rcirl_jax.data.formats.projection import utm, utm_zone
 from rcirl_jax.data.formats.tracks import split_tracks
@@ -42,6 +42,7 @@ from rcirl_jax.data.readers.tables.table import (
     read,
 )
 from rcirl_jax.data.recording import check_lanes_length, check_span, validate_recording
+from rcirl_jax.data.roads import roads_from_tracks
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Track
 
@@ -300,8 +301,8 @@ def _mapped_lanes(
         if min(apart) < FAR_M:
             return lanes, notes
         why = f"{place.name} lies elsewhere"
-    lanes = path_lanes(tracks, number(spec, "lane_width_m"), None)
-    return lanes, [f"{why}; {len(lanes)} lanes fitted to the longest paths"]
+    roads = roads_from_tracks(tracks, width=number(spec, "lane_width_m"))
+    return roads.lanes, [f"{why}: {roads.note}"]
 
 
 def _find_map(path: Path, location: str, spec: dict) -> Path | None:

@@ -26,7 +26,6 @@ import numpy as np
 
 from rcirl_jax.data.formats.declared import read_log, track_of
 from rcirl_jax.data.formats.files import files_below, log_name
-from rcirl_jax.data.formats.lanes import path_lanes
 from rcirl_jax.data.formats.options import number, one_of, one_pattern
 from rcirl_jax.data.formats.projection import utm, utm_zone
 from rcirl_jax.data.formats.shapes import local_origin
@@ -41,6 +40,7 @@ from rcirl_jax.data.readers.tables.rows import (
 from rcirl_jax.data.readers.tables.streams import head_of
 from rcirl_jax.data.readers.tables.table import Table, open_table
 from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.roads import roads_from_tracks
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Recording, Track
 
@@ -272,20 +272,19 @@ def _blocks(path: Path, spec: dict, stats: RowStats) -> Iterator[Recording]:
         tracks, origin = _tracks(path, t, cars, rows, automated, MAX_GAP_STEPS / rate)
         if not tracks:
             continue
-        found, lanes = True, path_lanes(tracks, width, None)
+        found, roads = True, roads_from_tracks(tracks, width=width)
         where = f"local origin at E = {origin[0]:.0f} m, N = {origin[1]:.0f} m"
-        fitted = f"no map; {len(lanes)} lanes fitted to the paths driven"
         yield Recording(
             name=name if numbers.size == 1 else f"{name}-{int(block):04d}",
             source=spec["source"],
             licence=spec["licence"],
             rate_hz=rate,
             tracks=tracks,
-            lanes=lanes,
+            lanes=roads.lanes,
             # files of one day share cars and drivers
             group=f"drives of {date}" if date else path.stem,
             default_speed_limit=number(spec, "default_speed_limit"),
-            notes=(*notes, *([where] if origin.any() else []), fitted),
+            notes=(*notes, *([where] if origin.any() else []), roads.note),
         )
     if not found:
         raise InputError(
