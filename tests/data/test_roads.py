@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from rcirl_jax.data.roads import roads_from_tracks
+from tests.data.formats.fixtures.drives import straight
 from tests.helpers.driven_roads import country_road, crossing, highway
 
 DRIVEN = {
@@ -145,3 +146,37 @@ def test_few_positions_make_few_lanes_or_none():
     assert roads_from_tracks([stands]).lanes == ()
     one = roads_from_tracks([still])
     assert len({lane.id.partition(".")[0] for lane in one.lanes}) == 1
+
+
+def test_a_lap_closes():
+    """Three laps of 1,885 m: lanes that lead back to their start."""
+    radius, t = 300.0, np.arange(0.0, 3.2 * 2 * np.pi * 15.0, 0.1)
+    jitter = 0.05 * np.random.default_rng(0).normal(size=(2, t.size))
+    places = radius * np.array([np.cos(t / 15.0), np.sin(t / 15.0)]) + jitter
+    user = dataclasses.replace(
+        straight(t, (0.0, 0.0), 0.0, 20.0),
+        **{"x": places[0], "y": places[1], "heading": t / 15.0 + np.pi / 2},
+    )
+    roads = roads_from_tracks([user])
+    assert roads_reached(roads, roads.lanes[0]) == {lane.id for lane in roads.lanes}
+    lanes = {lane.id: lane for lane in roads.lanes}
+    name, seen = roads.lanes[0].id, []
+    while name not in seen:
+        seen.append(name)
+        (name,) = lanes[name].successors
+    steps = [np.hypot(*np.diff(lane.centre, axis=0).T) for lane in roads.lanes]
+    assert 1870.0 < sum(step.sum() for step in steps) < 1930.0
+    assert max(step.max() for step in steps) < 26.0
+
+
+def test_lanes_of_opposite_directions_and_of_a_second_lane():
+    """A car that only jitters makes none."""
+    t = np.arange(200) * 0.1
+    there = straight(t, (0.0, 0.0), 0.0, 15.0)
+    back = straight(t, (300.0, 1.0), np.pi, 15.0)
+    beside = straight(t, (0.0, -5.0), 0.0, 15.0)
+    same = straight(t, (0.0, -1.0), 0.0, 14.0)
+    assert len(roads_from_tracks([there, back, beside, same]).lanes) == 3
+    parked, noise = straight(t, (5.0, 5.0), 0.0, 0.0), np.random.default_rng(1)
+    parked = dataclasses.replace(parked, x=5.0 + noise.normal(size=t.size))
+    assert roads_from_tracks([parked]).lanes == ()

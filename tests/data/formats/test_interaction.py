@@ -80,7 +80,7 @@ def test_maps_with_another_number(root, scene, name, maps, is_found):
         place.with_name(f"{other}.osm_xy").write_bytes(content)
     recording = only(root)
     assert ("30001" in logs.lanes_of(recording)) == is_found
-    note = "no map found; lanes fitted to the longest paths"
+    note = "no map found; lanes estimated from all tracks"
     assert (note in recording.notes) != is_found
 
 

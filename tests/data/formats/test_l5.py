@@ -176,14 +176,14 @@ def test_light_of_a_lane(whole):
 def test_without_a_map_of_the_place_lanes_are_paths(dataset):
     (recording,) = read(dataset.parent)
     assert recording.signals == ()
-    assert recording.lanes[0].id == "path-0"
-    assert any("fitted to the longest paths" in note for note in recording.notes)
+    assert recording.lanes[0].id.startswith("lane-")
+    assert any("estimated from all tracks" in note for note in recording.notes)
     matrix = fixture.WORLD_TO_ECEF.copy()
     matrix[:3, 3] += 1e5
     beside = dataset.with_name("meta.json")
     beside.write_text(json.dumps({"pose_to_ecef": matrix.tolist()}))
     fixture.write_map(beside.with_name("semantic_map.pb"))
-    assert read(dataset.parent)[0].lanes[0].id == "path-0"
+    assert read(dataset.parent)[0].lanes[0].id.startswith("lane-")
     beside.unlink()
     beside.with_name("semantic_map.pb").rename(dataset.parent / "palo.pb")
     assert len(read(dataset.parent, map="palo.pb")[0].lanes) == 4

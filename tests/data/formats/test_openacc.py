@@ -1,14 +1,11 @@
 """OpenACC: metadata, columns with holes, drivers, blocks, lanes of laps."""
 
-import dataclasses
 import functools
 
 import numpy as np
 import pytest
 
-from rcirl_jax.data.formats.lanes import path_lanes
 from tests.data.formats.fixtures import openacc as fixture
-from tests.data.formats.fixtures.drives import straight
 from tests.helpers import logs
 
 read = functools.partial(logs.read, "openacc")
@@ -151,37 +148,3 @@ def test_columns_but_no_car(tmp_path):
     columns = {"Time": ["0.0", "0.1"], "IVS1": ["1", "2"]}
     line = logs.refused(read, drive(tmp_path, columns))
     assert "expected Speed1, E1, N1" in line
-
-
-def test_lanes_close_a_lap():
-    """Three laps of 1,885 m: one chain of lanes that leads back to its start."""
-    radius, t = 300.0, np.arange(0.0, 3.2 * 2 * np.pi * 15.0, 0.1)
-    jitter = 0.05 * np.random.default_rng(0).normal(size=(2, t.size))
-    places = radius * np.array([np.cos(t / 15.0), np.sin(t / 15.0)]) + jitter
-    user = dataclasses.replace(
-        straight(t, (0.0, 0.0), 0.0, 20.0),
-        **{"x": places[0], "y": places[1], "heading": t / 15.0 + np.pi / 2},
-    )
-    lanes = {lane.id: lane for lane in path_lanes([user], 3.5, None)}
-    assert len(lanes) <= 6
-    name, seen = "path-0", []
-    while name not in seen:
-        seen.append(name)
-        (name,) = lanes[name].successors
-    assert set(seen) == set(lanes)
-    steps = [np.hypot(*np.diff(lane.centre, axis=0).T) for lane in lanes.values()]
-    assert 1870.0 < sum(step.sum() for step in steps) < 1930.0
-    assert max(step.max() for step in steps) < 26.0
-
-
-def test_lanes_of_opposite_directions_and_of_a_second_lane():
-    """A car that only jitters makes none."""
-    t = np.arange(200) * 0.1
-    there = straight(t, (0.0, 0.0), 0.0, 15.0)
-    back = straight(t, (300.0, 1.0), np.pi, 15.0)
-    beside = straight(t, (0.0, -5.0), 0.0, 15.0)
-    same = straight(t, (0.0, -1.0), 0.0, 14.0)
-    assert len(path_lanes([there, back, beside, same], 3.5, 20.0)) == 3
-    parked, noise = straight(t, (5.0, 5.0), 0.0, 0.0), np.random.default_rng(1)
-    parked = dataclasses.replace(parked, x=5.0 + noise.normal(size=t.size))
-    assert path_lanes([parked], 3.5, None) == ()

@@ -172,7 +172,7 @@ def _read(path: Path, spec: dict) -> tuple[Rows, RowStats]:
 def _scene(path: Path, spec: dict) -> _Scene:
     place = _find_map(path, spec)
     limit = number(spec, "default_speed_limit")
-    lanes, notes = None, ["no map found; lanes fitted to the longest paths"]
+    lanes, notes = None, ["no map found; lanes estimated from all tracks"]
     if place is not None:
         zone = utm_zone(0.0)
         origin = utm(np.zeros(1), np.zeros(1), zone)
