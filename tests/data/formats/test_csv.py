@@ -218,3 +218,18 @@ def test_far_coordinates_get_a_local_origin(tmp_path):
     recording = only(log(tmp_path, rows), spec(tmp_path))
     np.testing.assert_allclose(recording.tracks[0].x, 1.5 * np.arange(40))
     assert any("local origin" in note for note in recording.notes)
+
+
+def test_vehicles_that_have_no_rows_are_told(tmp_path):
+    """In the recording that is named, or in all, less the local origin."""
+    rest = "[[missing]]\ntime = [1.0, 9.0]\nx = [10.0, 90.0]\ny = [0.0, 5.0]\n"
+    (found,) = only(log(tmp_path), spec(tmp_path, rest=rest)).missing_agents
+    assert (found.t0, found.t1, found.start, found.end) == (
+        *(1.0, 9.0),
+        *((10.0, 0.0), (90.0, 5.0)),
+    )
+    other = spec(tmp_path, rest=rest + 'recording = "another"\n')
+    assert only(log(tmp_path), other).missing_agents == ()
+    short = spec(tmp_path, rest="[[missing]]\ntime = [1.0, 9.0]\n")
+    with pytest.raises(InputError, match="source TOML: missing: .*x: missing"):
+        only(log(tmp_path), short)

@@ -16,7 +16,7 @@ FORMAT = Format(
             {"file": "lanes.csv"},
         ],
         "missing": [
-            {"t": [0.0, 8.0], "x": [0.0, 99.0], "y": [0.0, 0.0], "recording": "d"}
+            {"time": [0.0, 8.0], "x": [0.0, 99.0], "y": [0.0, 0.0], "recording": "d"}
         ],
         "defaults": {"rate_hz": 10.0, "length": 4.5, "width": 1.8, "kind": "vehicle"},
     },

@@ -185,7 +185,7 @@ def _recording(
 class _Missing(msgspec.Struct, forbid_unknown_fields=True):
     """[[missing]]: a vehicle that drove there and has no rows."""
 
-    t: tuple[float, float]  # s, as in the log
+    time: tuple[float, float]  # s, as in the log
     x: tuple[float, float]  # m, at both times, as in the log
     y: tuple[float, float]
     recording: str = ""  # a value of the `recording` column, "": every one
@@ -198,8 +198,8 @@ def _missing(
     every = checked(spec.get("missing", []), list[_Missing], "source TOML: missing")
     return tuple(
         MissingAgent(
-            t0=one.t[0],
-            t1=one.t[1],
+            t0=one.time[0],
+            t1=one.time[1],
             start=(one.x[0] - origin[0], one.y[0] - origin[1]),
             end=(one.x[1] - origin[0], one.y[1] - origin[1]),
         )
