@@ -30,9 +30,11 @@ from rcirl_jax.data.inputs import (
     recordings_in,
     work_units,
 )
+from rcirl_jax.data.plans import MAX_PLANS, plan_of
 from rcirl_jax.data.quality import QualityReport, remedies
 from rcirl_jax.data.scenes.collect import CHUNK, Collector, assemble
 from rcirl_jax.data.scenes.config import CollectConfig, SignalChecks
+from rcirl_jax.data.scenes.lanes import LaneGraph
 from rcirl_jax.data.store.dataset import Dataset, Manifest
 from rcirl_jax.data.store.files import Files
 from rcirl_jax.data.store.rows import check_finite
@@ -124,6 +126,7 @@ class RecordingScenes:
     known: bool = False  # a committed shard holds it already
     refused: str = ""  # why nothing of it was read, where it is left out
     input: str = ""  # the file it was read from
+    plan: dict | None = None  # of the site, of the first recordings
     progress: float | None = None  # share of that file read after it, if known
 
 
@@ -211,11 +214,20 @@ def scenes_of(
 
 
 def scenes_in(
-    unit: WorkUnit, config: CollectConfig, done: Mapping[str, str] | None = None
+    numbered: tuple[WorkUnit, int],
+    config: CollectConfig,
+    done: Mapping[str, str] | None = None,
 ) -> Iterator[RecordingScenes]:
-    """Yield the scenes of each recording of a unit of work; see `scenes_of`."""
-    for file, recording in recordings_in(unit):
+    """Yield the scenes of each recording of a unit of work; see `scenes_of`.
+
+    The first recordings of the first units come with the plans of their sites.
+    """
+    unit, number = numbered
+    for place, (file, recording) in enumerate(recordings_in(unit)):
         made = scenes_of(recording, config, done)
+        if number + place < MAX_PLANS and not recording.refused:
+            plan = plan_of(recording, LaneGraph(recording))
+            made = dataclasses.replace(made, plan=plan)
         yield dataclasses.replace(made, input=str(file.input)) if file else made
 
 
@@ -302,6 +314,7 @@ class _Import:
         self.drivers: list[tuple[str, float]] = []
         self.lineage: list[dict] = []
         self.logs: set[str] = set()  # that scenes come from
+        self.plans: list[dict] = []
         committed = writer.committed()
         self.next_shard = len(committed)
         self.done = collections.deque(x for shard in committed for x in shard.lineage)
@@ -312,6 +325,8 @@ class _Import:
             raise InputError(f"{made.name}: name: met twice: expected once")
         number = self.recordings.setdefault(made.name, len(self.recordings))
         self.first_refused = self.first_refused or made.refused
+        if made.plan is not None and len(self.plans) < MAX_PLANS:
+            self.plans.append(made.plan)
         if made.rate_hz > 0.0:  # neither refused nor a file without rows
             self.sources[made.source] = made.licence
             self.rates.add(made.rate_hz)
@@ -427,6 +442,11 @@ class _Import:
             test_fraction=self.config.test_fraction,
             seed=self.config.split_seed,
         )
+
+        def planned(dataset: Dataset) -> None:
+            dataset.write_plans(self.plans)
+            before_commit(dataset)
+
         return self.writer.finish(
             {
                 "rate_hz": sorted(self.rates),
@@ -441,7 +461,7 @@ class _Import:
                 "quality": quality.as_dict(),
                 "import": {**self.config.as_dict(), "split_by": cut_by or kept},
             },
-            before_commit,
+            planned,
         )
 
 
@@ -489,7 +509,7 @@ def import_logs(
             known = {entry["name"]: entry["sha256"] for entry in state.done}
             work = functools.partial(scenes_in, config=config.collect, done=known)
             with Progress(len(files) or None) as progress:
-                for made in places.stream(work, units):
+                for made in places.stream(work, zip(units, itertools.count())):
                     state.add(made)
                     progress.show(made, state.quality)
             return state.finish(before_commit)

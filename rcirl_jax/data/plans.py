@@ -13,8 +13,8 @@ import numpy as np
 from rcirl_jax.data.scenes.lanes import LaneGraph
 from rcirl_jax.types import Kind, Recording, Track
 
-MAX_TRACKS = 300  # of a recording, evenly
-MAX_PLANS = 60  # recordings of a dataset
+MAX_TRACKS = 200  # of a recording, evenly
+MAX_PLANS = 12  # recordings of a dataset
 STEP_S = 0.5  # s between points of a track
 LANE_STEP_M = 3.0  # m between points of a lane
 STAYS_S = 1.0  # s on a lane, after which a driver has changed to it

@@ -12,12 +12,14 @@ import jax
 import numpy as np
 import tqdm
 
+from rcirl_jax.data.plans import facts_of
 from rcirl_jax.data.quality import oddities
 from rcirl_jax.data.scenes.filters import REASONS
 from rcirl_jax.data.store.dataset import Dataset
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import MALFORMED, InputError
 from rcirl_jax.report.pages import Table, facts_text, part, write_page
 from rcirl_jax.report.scene import describe_scene, draw_scene, spoken, tag_names
+from rcirl_jax.report.site import site_png
 from rcirl_jax.types import Tag
 
 TAG_NAMES = tuple(tag.name.lower() for tag in Tag)
@@ -100,6 +102,8 @@ def write_data_page(
         "driver with what the human then did; labels say what was decided about each "
         "road user.",
         tags=TAG_NAMES,
+        sites=_sites(dataset),
+        num_recordings=len(dataset.manifest.recordings),
         facts=_facts(dataset),
         drops=_drops(quality),
         tag_counts=_counts("scenes with a tag", quality["tags"], dataset.count),
@@ -114,6 +118,24 @@ def write_data_page(
         made_by=_provenance(dataset),
         page_facts=facts_text(facts),
     )
+
+
+def _sites(dataset: Dataset) -> list[dict]:
+    """Draw the plan of each site that the dataset has; with its facts and notes."""
+    try:
+        return [
+            {
+                "name": plan["name"],
+                "data": base64.b64encode(site_png(plan)).decode(),
+                "words": facts_of(plan),
+                "notes": plan["notes"],
+            }
+            for plan in dataset.plans()
+        ]
+    except MALFORMED as error:
+        raise InputError(
+            f"plans.json: {error}: expected plans of `rcirl import`"
+        ) from error
 
 
 def _scenes(folder: Path, dataset: Dataset, rows: Sequence[int]) -> list[dict]:

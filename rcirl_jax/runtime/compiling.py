@@ -38,9 +38,9 @@ CACHE_BYTES = 2 * 2**30  # of compiled programs that are kept
 def use_cache(most: int = CACHE_BYTES) -> Path | None:
     """Keeps compiled programs from process to process, in JAX's compilation cache.
 
-    The folder is that of JAX_COMPILATION_CACHE_DIR, which is left alone, or rcirl-jax in
-    the user's folder of caches. Of the latter the oldest programs are removed until the
-    others take `most` bytes. Workers keep theirs in it too.
+    The folder is that of JAX_COMPILATION_CACHE_DIR, which is left alone, or rcirl-jax
+    in the user's folder of caches. Of the latter the oldest programs are removed until
+    the others take `most` bytes. Workers keep theirs in it too.
 
     Returns:
       The folder; None where it cannot be written: nothing is kept then.

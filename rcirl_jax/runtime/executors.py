@@ -238,8 +238,9 @@ def _listed(
 
 def _name(item: object) -> str:
     """A piece in a message: its input file, if it has one."""
-    first = item[0] if isinstance(item, tuple) and item else item
-    return str(getattr(first, "input", first))[:200]
+    while isinstance(item, tuple) and item:
+        item = item[0]
+    return str(getattr(item, "input", item))[:200]
 
 
 def two_at_a_time(

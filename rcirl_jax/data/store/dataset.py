@@ -27,6 +27,7 @@ from rcirl_jax.data.store.files import (
     FACTS,
     MANIFEST,
     MARK,
+    PLANS,
     SHARDS,
     FileEntry,
     Files,
@@ -291,6 +292,30 @@ class Dataset(Demonstrations):
             raise InputError(f"{name}: {error}: expected JSON") from error
         if not isinstance(found, dict):
             raise InputError(f"{name}: expected an object")
+        return found
+
+    def write_plans(self, plans: Sequence[Mapping[str, object]]) -> None:
+        """Writes the plans of sites (`data.plans.plan_of`) beside the manifest.
+
+        Raises:
+          OSError: the place cannot be written.
+        """
+        text = json.dumps(plain(plans), allow_nan=False) + "\n"
+        self._files.write_many({PLANS: text.encode()})
+
+    def plans(self) -> list[dict[str, Any]]:
+        """Returns what `write_plans` wrote, or nothing.
+
+        Raises:
+          InputError: not a JSON list of objects.
+        """
+        raw, name = self._files.read_json(PLANS), self._files.path(PLANS)
+        try:
+            found = parse_json(raw or b"[]")
+        except ValueError as error:
+            raise InputError(f"{name}: {error}: expected JSON") from error
+        if not isinstance(found, list) or not all(isinstance(x, dict) for x in found):
+            raise InputError(f"{name}: expected a list of objects")
         return found
 
     def _arrays(self, shard: int) -> dict[str, ts.TensorStore]:

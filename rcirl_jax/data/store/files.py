@@ -23,9 +23,10 @@ from rcirl_jax.runtime.atomic_files import parse_json
 from rcirl_jax.runtime.pipeline import LOCK, only_one
 
 MANIFEST, MARK, SHARDS = "manifest.json", "shard.json", "shards/"
+PLANS = "plans.json"  # of the sites of the first recordings
 FACTS = "made_by.json"  # beside the manifest, whose bytes depend on the logs alone
 # of each; the manifest of 10 million scenes takes some 10 MiB
-JSON_BYTES = {MANIFEST: 2**30, MARK: 2**28, FACTS: 2**28}
+JSON_BYTES = {MANIFEST: 2**30, MARK: 2**28, FACTS: 2**28, PLANS: 2**28}
 SCHEMA_VERSION = 2  # of manifest.json and shard.json
 
 _T = TypeVar("_T")
