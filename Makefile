@@ -72,11 +72,11 @@ $(VENV)/.installed: pyproject.toml $(if $(LOCK),$(LOCK)/test.lock) | $(BIN)/pyth
 	$(call install,$(VENV),test)
 	@touch $(VENV)/.all $@
 
-# The main job, end to end, on synthetic human traffic: import, train, rank, simulate, gate, report.
+# The main job, end to end, on an excerpt of US-101: import, train, rank, simulate, gate, report.
 # Most of its time is compiling, which is a third shorter without XLA's fusion emitters.
 demo: $(VENV)/.all
-	XLA_FLAGS="$(NO_EMITTERS) $(XLA_FLAGS)" $(BIN)/rcirl autotune --synthetic --recipe=quick \
-	  --output=$(OUT) --cases=4 --duration=20 --drives=40
+	XLA_FLAGS="$(NO_EMITTERS) $(XLA_FLAGS)" $(BIN)/rcirl autotune --input=data_specs/demo/us101.csv.gz \
+	  --source=data_specs/demo/us101.toml --recipe=quick --output=$(OUT) --cases=4 --duration=20 --drives=40
 
 test: setup
 	$(TEST) $(EXACT)
