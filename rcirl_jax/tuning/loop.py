@@ -146,7 +146,18 @@ def _ending(run: Run, verdict: Verdict, page: str, first: str) -> str:
     step += f" --output={run.folder / 'case'}"
     if page.startswith(NO_REPORT):
         step = f"install it, then rcirl report --run={run.folder}"
-    return "\n".join([*lines, f"next: {step}"])
+    lines.append(f"next: {step}")
+    if verdict.part and verdict.decision == "could not judge":
+        usual = {"suite": "full", "cases": None, "duration_s": None, "drives": 240}
+        config = dataclasses.replace(run.config, **usual)
+        job, _ = suite_job(dataclasses.replace(run, config=config))
+        driven = len(job.refs) * job.duration_s + config.drives * DRIVE_S
+        lines.append(
+            "for a verdict that can ship: the same command without --suite, --cases, "
+            "--duration and --drives, about "
+            f"{in_words(DRIVEN_S * rows_of(job) * driven)} more on two usual cores"
+        )
+    return "\n".join(lines)
 
 
 def draw_again(run: Run, given: Sequence[str | Logs]) -> None:
@@ -185,6 +196,11 @@ def _said_of_weights(run: Run) -> str:
     return "\n".join(filter(None, (silent, prior)))
 
 
+def rows_of(job: SuiteJob) -> int:
+    """Counts who drives: rewards, baselines, the tuned IDM and two who judge."""
+    return len(job.weights) + len(job.baselines) + 3
+
+
 def work_of(
     run: Run, job: SuiteJob, dataset: Demonstrations | None
 ) -> dict[str, float] | None:
@@ -200,7 +216,6 @@ def work_of(
     config, plan = run.config, run.config.simulated
     counts = {name: dataset.indices(name).size for name in ("train", "test")}
     learned = TRAINED_S * counts["train"] * config.train.epochs
-    rows = len(job.weights) + len(job.baselines) + 3  # tuned IDM and two who judge
     cases = plan.cases + plan.rounds * plan.takeover_cases if plan.datasets else 0
     demonstrated = DRIVEN_S * len(suite_refs("full", 1)) * cases * plan.duration_s
     driven = len(job.refs) * job.duration_s + config.drives * DRIVE_S
@@ -208,7 +223,7 @@ def work_of(
         "demonstrate": demonstrated + (plan.rounds * learned if plan.datasets else 0.0),
         "train": config.seeds * learned,
         "rank": SEARCH_S + 2.0 * RANKED_S * counts["test"],
-        "simulate": DRIVEN_S * rows * driven,
+        "simulate": DRIVEN_S * rows_of(job) * driven,
         "gate": GATE_S,
         "report": PAGE_S,
     }
