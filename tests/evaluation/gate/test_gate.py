@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import textwrap
 
 import jax
@@ -227,6 +228,25 @@ def test_too_few_cases_cannot_be_judged():
          "min_ttc", "speed_limit", "on_road"), 0.02,
     )  # fmt: skip
     assert judge(few, GateConfig(**margins)).decision == "no difference"
+
+
+def test_a_part_of_the_suite_says_what_it_did_show():
+    """What got better with its interval, what is not told apart, and what to do."""
+    base = drives()
+    few = part_of(pair(further(base, 1.1), base), slice(None, None, 5))
+    verdict = judge(few, GateConfig(), part="800 of 4,140 cases")
+    assert verdict.decision == "could not judge"
+    head, better, apart, rest, then = verdict.sentence.rstrip(".").split(". ")
+    assert head == (
+        "Promising: on 800 cases nothing is worse for certain than with the incumbent"
+    )
+    assert re.fullmatch(r"Better: .*progress \+10\.0 % \[\+9\.\d+, .*\] %", better)
+    assert apart.startswith("Not told apart: ")
+    assert "progress" not in apart
+    assert rest == "800 cases are too few to ship"
+    assert then == "Next: drive the full suite"
+    same = judge(part_of(pair(base, base), slice(None, None, 5)), GateConfig(), part="a part")
+    assert same.sentence.startswith("Too early to tell: on 800 cases nothing is worse")
 
 
 def test_few_families_are_said_in_words_and_intervals_stay_where_shares_can_be():
