@@ -323,6 +323,10 @@ class Recording:
     # the first to before the second at which scenes begin; tracks reach beyond
     piece_of: str | None = None
     scenes_within: tuple[float, float] | None = None
+    # s on the log's own clock at t = 0, and m to add to places, where files of one
+    # stream can be told by them; None: the log has no clock
+    start_s: float | None = dataclasses.field(default=None, compare=False)
+    origin: tuple[float, float] = dataclasses.field(default=(0.0, 0.0), compare=False)
     # share in (0, 1] of its input that is read after it, where the importer knows;
     # for the progress bar only, no part of what was recorded
     progress: float | None = dataclasses.field(default=None, compare=False)

@@ -42,10 +42,12 @@ from rcirl_jax.data.store.splits import split_wholes, time_blocks
 from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError, LostWorkError
 from rcirl_jax.runtime.executors import Executor, Serial
-from rcirl_jax.types import Demonstration, Recording
+from rcirl_jax.types import Demonstration, Kind, Recording, Track
 
 SHARD_SCENES = 4096  # scenes after which a shard is closed
 GROUP_BLOCK_S = 60.0  # s; vehicles first seen in one block share a group
+ENDS_S = 1.0  # s, a vehicle seen so near to a recording's end may drive on in another
+AWAY_M = 3.0  # m, besides what its speed explains
 MINUTE = "/minute-"  # between a recording's name and the number of a block
 CHANGED = (
     "input or settings changed since the interrupted import: expected the same; use "
@@ -107,6 +109,61 @@ class Logs:
 # --------------------------------------------------------- one recording's scenes
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class End:
+    """A vehicle at the begin or end of its recording, where it may drive on."""
+
+    id: str  # in the log
+    is_begin: bool
+    t: float  # s, on the log's clock
+    x: float  # m, in the log's frame
+    y: float
+    speed: float  # m/s
+    vehicle: str
+    group: str
+
+    def goes_on(self, other: "End") -> bool:
+        """True if the other is the same vehicle a step later or earlier."""
+        apart = abs(other.t - self.t)
+        near = np.hypot(other.x - self.x, other.y - self.y)
+        reach = AWAY_M + 1.5 * max(self.speed, other.speed) * apart
+        first, second = (other, self) if self.is_begin else (self, other)
+        return (
+            self.id == other.id
+            and self.is_begin != other.is_begin
+            and first.t < second.t <= first.t + ENDS_S
+            and bool(near <= reach)
+        )
+
+
+def ends_of(recording: Recording, log: str) -> Iterator[End]:
+    """Yields the vehicles that may drive on in a recording before or after."""
+    vehicles = [x for x in recording.tracks if x.kind == Kind.VEHICLE]
+    if recording.start_s is None or recording.piece_of or not vehicles:
+        return
+    ends = min(x.t[0] for x in vehicles), max(x.t[-1] for x in vehicles)
+    for track in vehicles:
+        group = _group(recording, track, log)
+        for row, is_begin in ((0, True), (-1, False)):
+            if abs(track.t[row] - ends[row]) <= ENDS_S:
+                yield End(
+                    id=track.id.partition("#")[0],
+                    is_begin=is_begin,
+                    t=recording.start_s + float(track.t[row]),
+                    x=recording.origin[0] + float(track.x[row]),
+                    y=recording.origin[1] + float(track.y[row]),
+                    speed=float(track.speed[row]),
+                    vehicle=f"{group}:{track.id}",
+                    group=group,
+                )
+
+
+def _group(recording: Recording, track: Track, log: str) -> str:
+    """Vehicle-disjoint group of a track."""
+    minute = int(track.first_seen_s // GROUP_BLOCK_S)
+    return recording.group or f"{log}{MINUTE}{minute:04d}"
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class RecordingScenes:
     """The scenes of one recording, numbered in no dataset yet."""
@@ -127,6 +184,7 @@ class RecordingScenes:
     refused: str = ""  # why nothing of it was read, where it is left out
     input: str = ""  # the file it was read from
     plan: dict | None = None  # of the site, of the first recordings
+    ends: Sequence[End] = ()
     progress: float | None = None  # share of that file read after it, if known
 
 
@@ -176,6 +234,7 @@ def scenes_of(
         rate_hz=recording.rate_hz,
         sha256=hashlib.sha256((digest(recording) + repr(config)).encode()).hexdigest(),
         log=log,
+        ends=tuple(ends_of(recording, log)),
         refused=recording.refused,
         progress=recording.progress,
     )
@@ -199,10 +258,7 @@ def scenes_of(
         return dataclasses.replace(made, quality=report.state())
     scenes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *blocks)
     report.add_scenes(scenes)
-    groups = [
-        recording.group or f"{log}{MINUTE}{int(x.first_seen_s // GROUP_BLOCK_S):04d}"
-        for x in tracks
-    ]
+    groups = [_group(recording, track, log) for track in tracks]
     return dataclasses.replace(
         made,
         scenes=scenes,
@@ -315,6 +371,9 @@ class _Import:
         self.lineage: list[dict] = []
         self.logs: set[str] = set()  # that scenes come from
         self.plans: list[dict] = []
+        # of vehicles that may drive on in another recording, by the log's id
+        self.ends: dict[str, list[End]] = collections.defaultdict(list)
+        self.driven_on = 0  # vehicles that do
         committed = writer.committed()
         self.next_shard = len(committed)
         self.done = collections.deque(x for shard in committed for x in shard.lineage)
@@ -324,6 +383,7 @@ class _Import:
         if made.name in self.recordings:
             raise InputError(f"{made.name}: name: met twice: expected once")
         number = self.recordings.setdefault(made.name, len(self.recordings))
+        made = self._driving_on(made)
         self.first_refused = self.first_refused or made.refused
         if made.plan is not None and len(self.plans) < MAX_PLANS:
             self.plans.append(made.plan)
@@ -365,9 +425,38 @@ class _Import:
         if len(self.drivers) >= SHARD_SCENES:
             self._close_shard()
 
+    def _driving_on(self, made: RecordingScenes) -> RecordingScenes:
+        """Gives vehicles of a stream cut into files one name and group in all."""
+        same: dict[str, tuple[str, str]] = {}
+        for end in made.ends:
+            for known in self.ends[end.id]:
+                if known.goes_on(end) and known.vehicle != end.vehicle:
+                    same.setdefault(end.vehicle, (known.vehicle, known.group))
+        self.driven_on += len(same)
+        for end in made.ends:
+            vehicle, group = same.get(end.vehicle, (end.vehicle, end.group))
+            kept = dataclasses.replace(end, vehicle=vehicle, group=group)
+            self.ends[end.id].append(kept)
+        if not same:
+            return made
+        pairs = [
+            same.get(vehicle, (vehicle, group))
+            for vehicle, group in zip(made.vehicles, made.groups, strict=True)
+        ]
+        return dataclasses.replace(
+            made, vehicles=[x for x, _ in pairs], groups=[x for _, x in pairs]
+        )
+
     def _count(self, entry: dict) -> None:
         self.quality.merge(entry["quality"])
         self.sizes.update(entry["groups"])
+
+    def _said_of_streams(self) -> str:
+        """Returns the end of a line on vehicles in several recordings."""
+        count = self.driven_on
+        if not count:
+            return ""
+        return f"; {count} vehicles drive on from one recording to the next: one each"
 
     def _close_shard(self) -> None:
         if self.pending:
@@ -459,7 +548,10 @@ class _Import:
                 "vehicles": list(self.vehicles),
                 "splits": splits,
                 "quality": quality.as_dict(),
-                "import": {**self.config.as_dict(), "split_by": cut_by or kept},
+                "import": {
+                    **self.config.as_dict(),
+                    "split_by": (cut_by or kept) + self._said_of_streams(),
+                },
             },
             planned,
         )

@@ -69,6 +69,7 @@ class TimeSlice:
     """
 
     values: Rows  # t since the recording's start
+    start: float = 0.0  # s, of it on the log's clock
     number: int = 0  # of the minute, from the recording's first
     window: int | None = None  # of the minute; None: the minute is one slice
     within: tuple[float, float] = (-np.inf, np.inf)  # s, the minute or the window
@@ -336,8 +337,9 @@ class RowStore:
         """
         if self.folder is None:
             for values in self.minutes(recording):
-                t = values["t"] - values["t"].min()
-                yield TimeSlice(values={**values, "t": t}, is_whole=True)
+                start = float(values["t"].min())
+                values = {**values, "t": values["t"] - start}
+                yield TimeSlice(values=values, start=start, is_whole=True)
             return
         code, minutes = self._minutes(recording)
         users = self.texts_of("id")
@@ -366,6 +368,7 @@ class RowStore:
                 yield TimeSlice(
                     number=minute - int(np.floor(start / BLOCK_S)),
                     values=values,
+                    start=start,
                     within=(low - start, high - start),
                     fragments={
                         users[u] if users else str(u): [s - start for s in fragments[u]]

@@ -231,5 +231,5 @@ def test_vehicles_that_have_no_rows_are_told(tmp_path):
     other = spec(tmp_path, rest=rest + 'recording = "another"\n')
     assert only(log(tmp_path), other).missing_agents == ()
     short = spec(tmp_path, rest="[[missing]]\ntime = [1.0, 9.0]\n")
-    with pytest.raises(InputError, match="source TOML: missing: .*x: missing"):
+    with pytest.raises(InputError, match=r"source TOML: missing: .*x: missing"):
         only(log(tmp_path), short)

@@ -245,7 +245,9 @@ def test_a_part_of_the_suite_says_what_it_did_show():
     assert "progress" not in apart
     assert rest == "800 cases are too few to ship"
     assert then == "Next: drive the full suite"
-    same = judge(part_of(pair(base, base), slice(None, None, 5)), GateConfig(), part="a part")
+    same = judge(
+        part_of(pair(base, base), slice(None, None, 5)), GateConfig(), part="a part"
+    )
     assert same.sentence.startswith("Too early to tell: on 800 cases nothing is worse")
 
 

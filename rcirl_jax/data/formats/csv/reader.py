@@ -134,6 +134,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
                     values = meaning.applied(log.placed(part.values))
                     of = (values, log, meaning)
                     made = _recording(f"{name}{part.label}", recording, *of)
+                    made = dataclasses.replace(made, start_s=part.start)
                     made = attach_row_stats(part.of_log(name, made), log.stats)
                     yield validate_recording(made, file)
 
@@ -176,6 +177,7 @@ def _recording(
         rate_hz=columns.rate_hz,
         tracks=tracks,
         lanes=lanes,
+        origin=(float(origin[0]), float(origin[1])),
         missing_agents=_missing(spec, recording, origin),
         default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
         notes=(*columns.notes, *meaning.notes, *origin_notes(origin), *notes),
