@@ -42,6 +42,7 @@ EXTRA_M = 20.0  # m of lane beyond the first and last position
 PIECE_M = 400.0  # m, longest piece
 SMOOTHING_M = (30.0, 20.0, 14.0, 10.0, 7.0, 5.0, 3.5, 2.5)  # m, spreads that are tried
 MOST_SHIFT_M = 0.12  # m that smoothing may move a lane
+SURE = 0.9  # share of the way driven on lanes, below which they are doubtful
 VOTES = 0.25  # share of a lane's drivers that makes a successor
 
 
@@ -634,16 +635,75 @@ class Roads:
     lanes: tuple[Lane, ...]
     explained: float  # share of the way driven that lies on one of them
     width: float  # m between lanes that adjoin, NaN where none do
+    files: int = 1  # of whose tracks they are made
+
+    def explains(self, tracks: Sequence[Track]) -> float:
+        """Returns the share of the way driven by tracks that lies on the lanes."""
+        samples = _samples(tracks, None)
+        if samples is None or not self.lanes:
+            return 0.0
+        ridges = [
+            _Ridge(name=x.id, label="", line=_evenly(x.centre), ends=[-1, -1])
+            for x in self.lanes
+        ]
+        width = WIDTH_M if np.isnan(self.width) else self.width
+        return float(np.mean(_on(ridges, samples, width)[0] >= 0))
+
+    def moved(self, by: np.ndarray) -> "Roads":
+        """Returns the same in another frame.
+
+        Args:
+          by: [2] m, added to every place.
+        """
+        lanes = [dataclasses.replace(x, centre=x.centre + by) for x in self.lanes]
+        return dataclasses.replace(self, lanes=tuple(lanes))
 
     @property
     def note(self) -> str:
-        """Says what was found, in a line."""
+        """Says what was found, in a line, and what to do where that is not enough."""
         names = {lane.id.partition(".")[0] for lane in self.lanes}
         apart = "" if np.isnan(self.width) else f", {self.width:.1f} m apart"
+        files = f" of {self.files} files" if self.files > 1 else ""
+        remedy = "" if self.explained >= SURE else "; give lanes where they are wrong"
         return (
-            f"no lanes given; {len(names)} estimated from all tracks{apart}; "
-            f"{self.explained:.0%} of the way driven lies on them"
+            f"no lanes given; {len(names)} estimated from all tracks{files}{apart}; "
+            f"{self.explained:.0%} of the way driven lies on them{remedy}"
         )
+
+
+def roads_of_sites(
+    files: Sequence[Sequence[Track]], *, width: float = WIDTH_M, limit: float | None
+) -> list[Roads]:
+    """Estimates lanes from all files of one site together, in one frame.
+
+    Files are of one site if the lanes of the one with most driving explain the others.
+
+    Args:
+      files: the tracks of each.
+      width: m, as of `roads_from_tracks`.
+      limit: m/s, likewise.
+
+    Returns:
+      The roads of each file's site.
+    """
+    options = {"width": width, "limit": limit}
+    order = sorted(range(len(files)), key=lambda n: -sum(x.t.size for x in files[n]))
+    sites: list[tuple[list[int], Roads]] = []
+    for number in order:
+        for members, roads in sites:
+            if roads.explains(files[number]) >= SURE:
+                members.append(number)
+                break
+        else:
+            sites.append(([number], roads_from_tracks(files[number], **options)))
+    found: dict[int, Roads] = {}
+    for members, alone in sites:
+        roads = alone
+        if len(members) > 1:
+            every = [track for number in members for track in files[number]]
+            roads = roads_from_tracks(every, **options)
+        found |= dict.fromkeys(members, dataclasses.replace(roads, files=len(members)))
+    return [found[number] for number in range(len(files))]
 
 
 def roads_from_tracks(

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from rcirl_jax import import_logs
+from rcirl_jax import import_logs, read_logs
+from tests.helpers.driven_roads import crossing, highway
 
 
 def stream(shift=0.0):
@@ -62,3 +63,29 @@ def test_ids_that_another_file_uses_again_are_others(tmp_path):
     written(logs, "b.csv", [row for row in stream(900.0) if row[0] >= 60.0])
     dataset = import_logs(logs, tmp_path / "data", format="csv", test_fraction=0.5)
     assert "drive on" not in dataset.manifest.import_flags["split_by"]
+
+
+def test_files_of_one_place_have_its_roads_and_those_of_another_their_own(tmp_path):
+    """Two seconds have the lanes of the six minutes; the crossing keeps its own."""
+    logs, road = tmp_path / "logs", highway(minutes=4.0)
+    logs.mkdir()
+
+    def rows_of(tracks, low, high):
+        for track in tracks:
+            first, last = max(track.t[0], low), min(track.t[-1], high)
+            for t in np.arange(np.ceil(10.0 * first), 10.0 * last) / 10.0:
+                x, y = (np.interp(t, track.t, one) for one in (track.x, track.y))
+                yield t, track.id, x, y
+
+    written(logs, "a.csv", rows_of(road.tracks, 0.0, 238.0))
+    written(logs, "b.csv", rows_of(road.tracks, 238.0, 240.0))
+    written(logs, "c.csv", rows_of(crossing(minutes=3.0).tracks, 0.0, 180.0))
+    found = {one.name: one for one in read_logs(logs, format="csv")}
+    assert "of 2 files" in found["a"].notes[-1]
+    assert "of 2 files" in found["b"].notes[-1]
+    assert "files" not in found["c"].notes[-1]
+    names = [[lane.id for lane in found[name].lanes] for name in "abc"]
+    assert names[0] == names[1]
+    assert len(names[2]) > 12
+    for lane, other in zip(found["a"].lanes, found["b"].lanes, strict=True):
+        np.testing.assert_allclose(lane.centre, other.centre)

@@ -79,7 +79,8 @@ def parts(
 
     The recordings of all parts, one part after the other, are those of the whole
     input. A format whose module has no `parts(path, spec)` is one part. Where it has
-    `own_name(file)`, logs that are called alike in several folders are told apart.
+    `own_name(file)`, logs that are called alike in several folders are told apart;
+    where it has `shared_by(files)`, that is what the spec says of all of them.
 
     Args:
       name: key of `IMPORTERS`.
@@ -115,6 +116,8 @@ def parts(
         name_of = getattr(module, "own_name", None)
         if name_of is not None:
             spec = with_log_names(input_path, found, spec, name_of)
+        if (shared_by := getattr(module, "shared_by", None)) is not None:
+            spec = {**spec, **shared_by(found)}
     for path in found:
         if not is_text(str(path)):
             raise InputError(f"{path}: name: {path.name!a}: expected UTF-8; rename it")
