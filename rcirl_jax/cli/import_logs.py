@@ -16,6 +16,7 @@ recordings may be left out (--leave_out), counted and named in the report.
 """
 
 import dataclasses
+import shlex
 from pathlib import Path
 
 from absl import flags
@@ -23,6 +24,7 @@ from absl import flags
 from rcirl_jax.cli import flags as shared
 from rcirl_jax.cli.running import made_by_file
 from rcirl_jax.data.formats import IMPORTERS
+from rcirl_jax.data.formats.csv.reader import parts
 from rcirl_jax.data.formats.csv.suggest import suggested
 from rcirl_jax.data.formats.files import table_stem
 from rcirl_jax.data.formats.recognise import recognised_format
@@ -116,7 +118,14 @@ def main() -> None:
 
 
 def suggest(table: Path) -> None:
-    """Write a source TOML for a table, and show what it makes of the first rows."""
+    """Write a source TOML for a table, and show what it makes of the first rows.
+
+    Of a folder, for its first table.
+    """
+    given = table
+    if table.is_dir():
+        table = parts(table, {})[0]
+        print(f"{table}: the first table of the folder")
     if not table.is_file():
         raise InputError(f"{table}: --suggest: missing: expected a table")
     target = Path(_OUTPUT.value or f"{table_stem(table)}.toml")
@@ -127,10 +136,10 @@ def suggest(table: Path) -> None:
     found = suggested(table)
     write_whole(target, found.toml)
     print(*found.lines, sep="\n")
+    source, logs = shlex.quote(str(target)), shlex.quote(str(given))
     print(
         f"\nwritten: {target}; read it through, then\n"
-        f"  rcirl import --format=csv --source={target} "
-        f"--input={table} --output=DATASET"
+        f"  rcirl import --format=csv --source={source} --input={logs} --output=DATASET"
     )
 
 

@@ -54,7 +54,7 @@ FULL = ("-helpfull", "--helpfull")
 WIDTH, INDENT = 100, 20  # columns of help
 LONGEST = 40  # characters of a default
 FROM_FILE = "--flagfile=FILE reads flags from a file, one a line."
-_CACHE = flags.DEFINE_bool(
+flags.DEFINE_bool(
     "compilation_cache",
     True,
     "keep compiled programs in the user's folder of caches, 2 GiB at most",
@@ -74,7 +74,7 @@ def run(main: Callable[[], None]) -> None:
     def guarded(argv: list[str]) -> None:
         try:
             _take(argv[1:], main)
-            if _CACHE.value:
+            if flags.FLAGS["compilation_cache"].value:
                 use_cache()
             main()
         except InputError as error:

@@ -115,6 +115,10 @@ class PriorCost:
     out: np.ndarray  # [H]
     offset: np.ndarray  # [1] c
 
+    def __repr__(self) -> str:
+        """Return the incumbent and the gains: arrays would fill pages."""
+        return f"PriorCost({self.incumbent}, gain {self.low:g} to {self.high:g})"
+
     @np.errstate(all="ignore")
     def gain(self, first: np.ndarray) -> np.ndarray:
         """Return gains of V, summed in float64.
@@ -157,6 +161,16 @@ class Reward:
     prior_cost: PriorCost | None = None  # drives on top of an incumbent, by `total`
     loss: dict[str, Any]  # name; leaky_rate of the rank loss, or None
     provenance: dict[str, Any]
+
+    def __repr__(self) -> str:
+        """Return the file, features, layers and loss: arrays would fill pages."""
+        layers = [self.kernels[0].shape[0], *(x.shape[1] for x in self.kernels)]
+        prior = ", on a prior cost" if self.prior_cost is not None else ""
+        return (
+            f"Reward({self.file or 'made here'}: {self.preset}, layers "
+            f"{'-'.join(map(str, layers))}, loss {self.loss.get('name')}{prior}, "
+            f"sha256 {self.sha256[:16]})"
+        )
 
     @property
     def unsupported(self) -> tuple[str, ...]:

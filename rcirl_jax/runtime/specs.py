@@ -36,7 +36,8 @@ def load_toml(path: Path) -> dict:
         with Path(path).open("rb") as file:
             content = file.read(MAX_BYTES + 1)
     except OSError as error:
-        raise InputError(f"{path}: {error}: expected a readable file") from error
+        why = error.strerror or error
+        raise InputError(f"{path}: {why}: expected a readable file") from error
     if len(content) > MAX_BYTES:
         raise InputError(f"{path}: size: expected at most {MAX_BYTES >> 20} MiB")
     try:

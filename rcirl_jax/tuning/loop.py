@@ -9,6 +9,7 @@ which does not grow with the work, counts in neither.
 """
 
 import dataclasses
+import shlex
 import textwrap
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -142,10 +143,10 @@ def _ending(run: Run, verdict: Verdict, page: str, first: str) -> str:
     lines += [f"weights: {run.weights}", f"all tables: {run.tables}"]
     lines += [page] if page else []
     case = (*verdict.look_at, first)[0]
-    step = f"rcirl replay --weights={run.weights} --case={case}"
-    step += f" --output={run.folder / 'case'}"
+    weights, folder = (shlex.quote(str(x)) for x in (run.weights, run.folder))
+    step = f"rcirl replay --weights={weights} --case={case} --output={folder}/case"
     if page.startswith(NO_REPORT):
-        step = f"install it, then rcirl report --run={run.folder}"
+        step = f"install it, then rcirl report --run={folder}"
     lines.append(f"next: {step}")
     if verdict.part and verdict.decision == "could not judge":
         usual = {"suite": "full", "cases": None, "duration_s": None, "drives": 240}

@@ -252,3 +252,11 @@ def test_the_site_is_searched_from_the_disk(site):
         found.wait_for(state="attached", timeout=60_000)
         assert "csv" in (found.text_content() or "")
         browser.close()
+
+
+@pytest.mark.parametrize("name", ["own_planner.py", "own_planner.cpp"])
+def test_the_page_shows_the_programs_as_they_are(name):
+    """A code host shows the page without the site's snippets."""
+    page, file = (DOCS / "own_planner.md").read_text(), REPO / "onboard/example" / name
+    assert f'title="onboard/example/{name}"\n{file.read_text()}```' in page
+    assert "--8<--" not in page

@@ -329,3 +329,10 @@ def test_scene_gating_needs_the_first_time():
         reward.value(features, late)
     with pytest.raises(InputError, match=r"samples\.valid\[1, 0\]: 0: expected 1 at"):
         pack(weights, features, late, values)
+
+
+def test_a_reward_says_what_it_is_in_a_line():
+    """Arrays would fill pages."""
+    said = repr(decode_weights(WITH_PRIOR, "w.msgpack"))
+    assert len(said) < 200
+    assert said.startswith("Reward(w.msgpack: ")

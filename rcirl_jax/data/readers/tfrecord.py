@@ -66,7 +66,8 @@ def read_records(path: Path, limit: int = MAX_RECORD_BYTES) -> Iterator[bytes]:
                 count += 1
                 yield data
     except OSError as error:
-        raise InputError(f"{path}: {error}: expected a readable file") from error
+        why = error.strerror or error
+        raise InputError(f"{path}: {why}: expected a readable file") from error
     if count == 0:
         raise InputError(f"{path}: records: none: expected at least one")
 

@@ -252,6 +252,14 @@ class Dataset(Demonstrations):
         self._starts = np.cumsum([0, *counts])
         self._open: dict[int, dict[str, ts.TensorStore]] = {}
 
+    def __repr__(self) -> str:
+        """Returns the folder, and how many scenes of how many recordings it has."""
+        recordings = len(self.manifest.recordings)
+        return (
+            f"Dataset({self._files.name}: {self.count:,} scenes of {recordings:,} "
+            f"recordings)"
+        )
+
     def __getitem__(self, row: int) -> Demonstration:
         """Returns one row; numpy leaves without the row's axis.
 
