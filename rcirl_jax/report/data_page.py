@@ -188,7 +188,8 @@ def _facts(dataset: Dataset) -> Table:
     rows += [(words, "") for words in oddities(quality)]
     for split, groups in manifest.splits.items():
         count = dataset.indices(split).size
-        words = f"{count:,} scenes in {len(groups):,} groups that share no vehicle"
+        many = "group" if len(groups) == 1 else "groups that share no vehicle"
+        words = f"{count:,} scenes in {len(groups):,} {many}"
         rows.append((f"split {split}", words))
     if "split_by" in manifest.import_flags:
         rows.append(("split by", manifest.import_flags["split_by"]))
