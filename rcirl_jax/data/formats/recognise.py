@@ -50,15 +50,27 @@ def recognised_format(path: Path | None, source: Path | None = None) -> str:
     files = [path] if path.is_file() else _matching(path, TABLES)
     table = next((f for f in files if f.is_file() and any(map(f.match, TABLES))), None)
     if table is not None:
+        tomls = path.glob("*.toml") if path.is_dir() else ()
+        there = next((file for file in sorted(tomls) if _is_source(file)), None)
+        which = f"which `rcirl import --suggest={table}` writes"
+        if there is not None:
+            which = f"perhaps {there}, which is there"
         raise InputError(
             f"{table}: format: not given: a table of no known data set: expected "
-            "format csv with a source TOML that names its columns, which "
-            f"`rcirl import --suggest={table}` writes"
+            f"format csv with a source TOML that names its columns, {which}"
         )
     raise InputError(
         f"{path}: format: not given: no files of a known format: expected "
         f"one of {', '.join(sorted(IMPORTERS))}"
     )
+
+
+def _is_source(file: Path) -> bool:
+    """True for a TOML that says what columns of a table mean."""
+    try:
+        return "columns" in load_toml(file)
+    except InputError:
+        return False
 
 
 def _matching(path: Path, patterns: tuple[str, ...]) -> Iterator[Path]:
@@ -70,7 +82,7 @@ def _format_of(file: Path, source: Path | None) -> str:
     forms = {name: format_of(name) for name in IMPORTERS}
     for name, form in forms.items():
         if any(map(file.match, form.names)):
-            return name
+            return "" if file.suffix == ".toml" and _is_source(file) else name
     if not file.is_file():
         return ""
     table = None

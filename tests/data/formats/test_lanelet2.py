@@ -1,5 +1,8 @@
 """Lanelet2 maps: geometry, links, rules, positions; hostile and broken files."""
 
+import copy
+from xml.etree import ElementTree
+
 import numpy as np
 import pytest
 
@@ -184,6 +187,27 @@ def test_positions_in_degrees_and_in_local_tags(tmp_path, lanes):
     for name, lane in lanes.items():
         np.testing.assert_allclose(degrees[name].centre, lane.centre, atol=1e-3)
         np.testing.assert_allclose(tagged[name].centre, lane.centre, atol=1e-9)
+
+
+def test_ways_of_a_bound_meet_in_two_nodes_at_one_place(tmp_path, lanes):
+    """Every way with nodes of its own: the same lanes."""
+    file = metres(tmp_path / "twins")
+    tree = ElementTree.parse(file)
+    root, number = tree.getroot(), 900_000
+    nodes = {node.get("id"): node for node in root.iter("node")}
+    for way in root.findall("way"):
+        for ref in way.findall("nd"):
+            number += 1
+            twin = copy.deepcopy(nodes[ref.get("ref")])
+            twin.set("id", str(number))
+            ref.set("ref", str(number))
+            root.insert(0, twin)
+    tree.write(file)
+    found, _ = read(file)
+    assert found.keys() == lanes.keys()
+    for name, lane in lanes.items():
+        np.testing.assert_allclose(found[name].centre, lane.centre, atol=1e-9)
+        assert found[name].successors == lane.successors
 
 
 def test_lanelets_without_two_bounds_are_noted(tmp_path):

@@ -24,6 +24,10 @@ def test_a_table_of_ones_own_needs_a_source_or_the_usual_names(tmp_path):
         assert f"--suggest={path}" in line
     source = people.spec(tmp_path)
     assert recognised_format(path, source) == "csv"
+    # a source TOML beside the log is no synthetic traffic
+    line = refused(recognised_format, tmp_path)
+    assert line.startswith(f"{path}: format: not given: a table of no known")
+    assert f"perhaps {source}, which is there" in line
 
 
 def test_what_is_nothing_or_several_is_one_line(tmp_path):

@@ -40,6 +40,7 @@ NOT_FOR_VEHICLES = (
 )
 MAX_FILE_BYTES = 256 * 1024**2  # bytes, larger files are refused
 MIN_STEP_M = 0.25  # m between points of a lane
+SEAM_M = 0.05  # m between the ends of two ways of a bound that meet
 SAME_PLACE_M = 1e-3  # m, end points that near are one
 MAX_LATITUDE = 84.0  # degrees, UTM ends there
 MAX_NODES = 5_000_000  # of all bounds; 2500 km of lanes, a point a metre
@@ -273,7 +274,7 @@ class _World:
         return np.array([self.points[node] for node in nodes])
 
     def _bound(self, names: list[str]) -> tuple[str, ...]:
-        """Nodes of a bound; its ways joined where they share an end. () if broken."""
+        """Nodes of a bound; its ways joined where their ends meet. () if broken."""
         if len(names) > MAX_WAYS:
             raise InputError(
                 f"{self.path}: bound with way {names[0][:40]}: {len(names)} ways: "
@@ -283,10 +284,29 @@ class _World:
             return ()
         joined, *parts = (self.ways[name] for name in dict.fromkeys(names))
         while parts:
-            joined = _extended(joined, parts)
+            joined = self._extended(joined, parts)
             if not joined:
                 return ()
         return tuple(joined)
+
+    def _extended(self, joined: list[str], parts: list[list[str]]) -> list[str]:
+        """The line with one more of the parts (which is removed), or []."""
+        for place, part in enumerate(parts):
+            for nodes in (part, part[::-1]):
+                if self._meet(joined[-1], nodes[0]):
+                    del parts[place]
+                    return joined + nodes[1:]
+                if self._meet(joined[0], nodes[-1]):
+                    del parts[place]
+                    return nodes[:-1] + joined
+        return []
+
+    def _meet(self, one: str, other: str) -> bool:
+        """True for one node, and for two at one place (exports double them)."""
+        if one == other:
+            return True
+        gap = np.subtract(self.points[one], self.points[other])
+        return bool(np.hypot(*gap) <= SEAM_M)
 
     def _gate(self, lanelet: _Lanelet, end: int) -> tuple:
         """Where a lanelet begins (0) or ends (-1): its two corner points."""
@@ -331,19 +351,6 @@ class _World:
                 stop_line=stop_line,
                 stop_sign=stop_sign,
             )
-
-
-def _extended(joined: list[str], parts: list[list[str]]) -> list[str]:
-    """The line with one more of the parts (which is removed), or []."""
-    for place, part in enumerate(parts):
-        for nodes in (part, part[::-1]):
-            if joined[-1] == nodes[0]:
-                del parts[place]
-                return joined + nodes[1:]
-            if joined[0] == nodes[-1]:
-                del parts[place]
-                return nodes[:-1] + joined
-    return []
 
 
 def _first_speed(texts: list[str]) -> float | None:

@@ -30,7 +30,7 @@ from rcirl_jax.data.formats.options import (
     recording_car,
     section,
 )
-from rcirl_jax.data.formats.perception import without_outliers
+from rcirl_jax.data.formats.perception import fitted_lanes, without_outliers
 from rcirl_jax.data.formats.shapes import (
     check_coordinates,
     local_origin,
@@ -126,6 +126,9 @@ def _read_scenario(where: str, default: str, data: bytes, spec: dict) -> Recordi
     y -= origin[1]
     tracks, notes = _tracks(where, scenario, t, values, valid, spec)
     lanes, signals, map_notes = read_map(where, scenario, t, origin, spec)
+    if not lanes:
+        lanes, note = fitted_lanes(tracks, spec)
+        map_notes = [*map_notes, f"no lanes in the map: {note}"]
     name = scenario.scenario_id[:MAX_NAME] or default
     limits = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
     if WINDOW_S[0] < t[-1] < WINDOW_S[1]:
