@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from rcirl_jax.data.formats.csv.suggest import fields_by_name, suggested
+from rcirl_jax.data.formats.csv.suggest import fields_by_name, suggested, unit_of
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml
 from tests.data.formats import people
@@ -203,3 +203,19 @@ def test_by_its_command(tmp_path):
     assert done.stderr == "error: nowhere.csv: --suggest: missing: expected a table\n"
     done = command("rcirl_jax", "import", "--format=csv")
     assert done.stderr.startswith("error: --output: not given: expected")
+
+
+@pytest.mark.parametrize(
+    ("header", "x", "unit"),
+    [
+        ("carCenterX carCenterY headXft headYft carCenterXft carCenterYft",
+         "carCenterXft", "ft"),
+        ("x_px y_px x_m y_m", "x_m", "m"),
+        ("frontX frontY posX posY rearX rearY", "posX", ""),
+        ("xpixel ypixel east north", "east", ""),
+    ],
+)  # fmt: skip
+def test_pixels_and_points_that_are_no_middle_come_last(header, x, unit):
+    names = ["frame", "id", *header.split()]
+    assert fields_by_name(names)["x"] == x
+    assert unit_of(x, ("m", "ft")) == unit

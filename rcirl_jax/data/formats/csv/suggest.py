@@ -60,6 +60,7 @@ NO_RATE = "rate_hz: rows per second of one road user; 10 is assumed"
 LONG_CAR_M = 9.0  # m; a longer median vehicle was measured in feet
 # recorded speed over that of the positions, both in m/s if it were m/s
 SPEED_RATIOS = {"m/s": 1.0, "km/h": 3.6, "ft/s": 3.2808, "mph": 2.2369, "kn": 1.9438}
+PIXELS = {"px", "pix", "pixel", "pixels"}  # words of a name, of no use as metres
 ROWS_SHOWN = 5
 # field -> its unit where rows are shown, "": none
 SHOWN = {
@@ -435,7 +436,7 @@ def _words() -> dict:
 
 def plain_words(name: str) -> list[str]:
     """Returns words of a column's name without those of a unit; owners stand apart."""
-    bare = re.sub(r"[\[(].*?[\])]", " ", name)
+    bare = re.sub(r"[\[(].*?[\])]", " ", with_unit_apart(name))
     units = {
         text for texts in _words()["units"].values() for text in texts if len(text) > 1
     }
@@ -447,8 +448,28 @@ def plain_words(name: str) -> list[str]:
     return [w for w in words if w not in units and w not in ("kf", "smoothed", "raw")]
 
 
+def with_unit_apart(name: str) -> str:
+    """Returns "headX [ft]" of "headXft": a unit that is glued to a coordinate."""
+    return re.sub(r"([XY])(ft|m|cm|px|pix|pixels?)$", r"\1 [\2]", name)
+
+
+def is_no_place(name: str, header: Sequence[str]) -> bool:
+    """True for a coordinate in pixels, or of another point than the middle.
+
+    A column without a unit is one of pixels where another is called alike, with a unit.
+    """
+    said = with_unit_apart(name)
+    if re.search(r"\[(px|pix|pixels?)\]$", said) or set(plain_words(name)) & PIXELS:
+        return True
+    if not set(_words()["not_middle"]).isdisjoint(plain_words(name)):
+        return True
+    twins = (with_unit_apart(other) for other in header if other != name)
+    return said == name and any(twin.startswith(f"{name} [") for twin in twins)
+
+
 def unit_of(name: str, allowed: Sequence[str]) -> str:
     """Returns the unit that a column's name says, "" without one."""
+    name = with_unit_apart(name)
     said = re.findall(r"[\[(]\s*(.+?)\s*[\])]", name)
     said += [name.rsplit("_", 1)[-1]] if "_" in name else []
     for text in said:
@@ -476,10 +497,11 @@ def fields_by_name(header: Sequence[str]) -> dict[str, str]:
             )
             if name in found.values():
                 continue
+            last = field in ("x", "y") and is_no_place(name, header)
             if (joined := "".join(own)) in known:
-                scores[name] = 0, known.index(joined)
+                scores[name] = last, 0, known.index(joined)
             elif hits and not is_other:
-                scores[name] = len(set(own)) - 1, min(hits)
+                scores[name] = last, len(set(own)) - 1, min(hits)
         if scores:
             found[field] = min(scores, key=lambda name: scores[name])
     others = ("x", "y") if {"lat", "lon"} <= found.keys() else ("lat", "lon")
