@@ -199,4 +199,5 @@ def test_a_dataset_being_written_is_refused_and_left_alone(tmp_path):
         assert [x.name for x in data.iterdir()] == [".lock"]
     # the file of a killed import holds nobody up, and does not stay
     import_logs(logs, data, IMPORT)
-    assert sorted(x.name for x in data.iterdir()) == ["manifest.json", "shards"]
+    names = sorted(x.name for x in data.iterdir())
+    assert names == ["manifest.json", "plans.json", "shards"]
