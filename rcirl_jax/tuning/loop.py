@@ -147,7 +147,6 @@ def _ending(run: Run, verdict: Verdict, page: str, first: str) -> str:
     step = f"rcirl replay --weights={weights} --case={case} --output={folder}/case"
     if page.startswith(NO_REPORT):
         step = f"install it, then rcirl report --run={folder}"
-    lines.append(f"next: {step}")
     if verdict.part and verdict.decision == "could not judge":
         usual = {"suite": "full", "cases": None, "duration_s": None, "drives": 240}
         config = dataclasses.replace(run.config, **usual)
@@ -158,7 +157,7 @@ def _ending(run: Run, verdict: Verdict, page: str, first: str) -> str:
             "--duration and --drives, about "
             f"{in_words(DRIVEN_S * rows_of(job) * driven)} more on two usual cores"
         )
-    return "\n".join(lines)
+    return "\n".join([*lines, f"next: {step}"])
 
 
 def draw_again(run: Run, given: Sequence[str | Logs]) -> None:

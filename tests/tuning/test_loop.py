@@ -93,7 +93,9 @@ def test_a_report_that_cannot_be_drawn_is_one_line(monkeypatch):
 
 def test_what_to_do_next_without_a_report_is_to_have_one(tmp_path):
     run = types.SimpleNamespace(weights="w", tables="t", folder=tmp_path)
-    verdict = types.SimpleNamespace(decision="ship", sentence="Ship.", look_at=("a@0",))
+    verdict = types.SimpleNamespace(
+        decision="ship", sentence="Ship.", look_at=("a@0",), part=""
+    )
 
     def last(page):
         return loop._ending(run, verdict, page, "b@0").splitlines()[-1]
