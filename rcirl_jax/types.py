@@ -23,17 +23,7 @@ import flax.struct
 import jax
 import numpy as np
 
-
-class Kind(enum.IntEnum):
-    """What an obstacle is. Stored in `Obstacles.kind`."""
-
-    NONE = 0  # an empty slot
-    VEHICLE = 1
-    CYCLIST = 2
-    PEDESTRIAN = 3
-    STATIC = 4  # a standing object that never moves
-    STOP = 5  # a stop line or a red light; valid only while it demands a stop
-    VIRTUAL = 6  # the destination of the route
+from rcirl_jax.units import Kind as Kind
 
 
 class Decision(enum.IntEnum):

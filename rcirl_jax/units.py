@@ -1,8 +1,12 @@
-"""Every physical constant of the package: name, value, unit, source.
+"""Every physical constant of the package, and the codes of its arrays.
+
+A constant has its name, value, unit and source.
 
 Inside the package everything is SI and radians. Constants that belong to one
 algorithm's configuration live in that algorithm's config dataclass instead.
 """
+
+import enum
 
 import numpy as np
 
@@ -27,3 +31,15 @@ MPH_MPS = 0.44704  # m/s per mile per hour
 # --- physics and vehicles ---
 EGO_LENGTH_M = 4.933  # m, Lincoln MKZ (Apollo vehicle_param)
 EGO_WIDTH_M = 2.11  # m, Lincoln MKZ with mirrors (Apollo vehicle_param)
+
+
+class Kind(enum.IntEnum):
+    """The kinds of obstacles, as stored in `Obstacles.kind`."""
+
+    NONE = 0  # an empty slot
+    VEHICLE = 1
+    CYCLIST = 2
+    PEDESTRIAN = 3
+    STATIC = 4  # a standing object that never moves
+    STOP = 5  # a stop line or a red light; valid only while it demands a stop
+    VIRTUAL = 6  # the destination of the route

@@ -2,7 +2,7 @@
 
     python own_planner.py weights.msgpack
 
-Beside it: copies of features/columns.py, export/own_planner/features.py and
+Beside it: copies of features/columns.py, units.py, export/own_planner/features.py and
 export/reader.py of rcirl_jax. The C++ twin, own_planner.cpp, prints the same numbers.
 """
 

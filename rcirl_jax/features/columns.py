@@ -1,8 +1,8 @@
 """The feature map F, one pure function per feature: (frame of points) -> column.
 
 Runs on numpy and on JAX: `namespace` says whose arrays it was given. It imports numpy
-alone, so that a planner may copy it, with `export/own_planner/features.py`, and compute
-F without JAX.
+and `units.py` alone, so that a planner may copy both, with
+`export/own_planner/features.py`, and compute F without JAX.
 
 `COLUMNS` maps the name used in data_specs/features/*.toml to the function that
 computes it. To add a feature: write a function here, name it there. The
@@ -31,11 +31,15 @@ that it gathers. What is read together stands in one table; XLA drops a table th
 nobody reads.
 """
 
-import enum
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+
+try:
+    from rcirl_jax import units
+except ImportError:  # both files were copied
+    import units  # pyright: ignore[reportMissingImports]
 
 Array = Any  # of numpy, or of JAX
 # of rcirl_jax.types, or plain ones with the same fields
@@ -43,12 +47,7 @@ Scene = Any
 Ego = Any
 Obstacles = Any
 Trajectory = Any
-
-NUM_TIMES = 18  # T
-HORIZON_S = 8.0  # s
-DT_S = HORIZON_S / (NUM_TIMES - 1)  # s, 0.470588
-TIMES_S = np.linspace(0.0, HORIZON_S, NUM_TIMES).astype(np.float32)  # [T] s
-STATION_STEP_M = 2.0  # m between points of the station grid
+DT_S, Kind = units.DT_S, units.Kind
 
 
 def namespace(*arrays: Array) -> Any:  # noqa: ANN401
@@ -57,18 +56,6 @@ def namespace(*arrays: Array) -> Any:  # noqa: ANN401
     others = (x for x in arrays if not isinstance(x, numpy))
     other = next(others, None)
     return np if other is None else other.__array_namespace__()
-
-
-class Kind(enum.IntEnum):
-    """What an obstacle is."""
-
-    NONE = 0  # an empty slot
-    VEHICLE = 1
-    CYCLIST = 2
-    PEDESTRIAN = 3
-    STATIC = 4  # a standing object that never moves
-    STOP = 5  # a stop line or a red light; valid only while it demands a stop
-    VIRTUAL = 6  # the destination of the route
 
 
 SLOPE_POINTS = 3  # grid points on each side for dl/ds: 6 m, about a car's length
@@ -115,7 +102,7 @@ def table_slope(table: Array, points: int) -> Array:
     first, last = (xp.broadcast_to(table[i], (points,)) for i in (0, -1))
     padded = xp.concatenate([first, table, last])
     return (padded[2 * points :] - padded[: -2 * points]) / (
-        2.0 * points * STATION_STEP_M
+        2.0 * points * units.STATION_STEP_M
     )
 
 
@@ -124,7 +111,7 @@ def path_view(scene: Scene, s: Array) -> PathView:
     path = scene.path
     xp = namespace(s, path.l)
     dl = table_slope(path.l, SLOPE_POINTS)
-    position = xp.clip(s / STATION_STEP_M, 0.0, path.l.shape[0] - 1.0)
+    position = xp.clip(s / units.STATION_STEP_M, 0.0, path.l.shape[0] - 1.0)
     low = xp.minimum(position.astype(xp.int32), path.l.shape[0] - 2)
     share = position - low.astype(xp.float32)
 
@@ -146,7 +133,7 @@ def path_view(scene: Scene, s: Array) -> PathView:
     return PathView(l, dl_at, ddl, kappa, dkappa, limit, road_left, road_right)
 
 
-FIRST = np.arange(NUM_TIMES) == 0  # [T]
+FIRST = np.arange(units.NUM_TIMES) == 0  # [T]
 MIN_ADVANCE_M = 1.0  # m between neighbours below which dl/ds is taken as 0
 
 

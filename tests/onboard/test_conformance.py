@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from onboard.conformance import check, make
+from rcirl_jax import units
 from rcirl_jax.export import load_weights
 from rcirl_jax.export.own_planner import features
 from rcirl_jax.export.own_planner.builder import plain_scene
@@ -133,8 +134,8 @@ FAULTS = {
 
 
 def numpy_files(module, old, new, folder, monkeypatch):
-    """The two files as a planner copies them, with one text of one replaced."""
-    for file in (f, features):
+    """The three files as a planner copies them, with one text of one replaced."""
+    for file in (f, features, units):
         text = Path(file.__file__).read_text()
         if file is module and old:
             assert text.count(old) == 1
@@ -142,7 +143,7 @@ def numpy_files(module, old, new, folder, monkeypatch):
         (folder / Path(file.__file__).name).write_text(text)
     monkeypatch.syspath_prepend(folder)
     monkeypatch.setitem(sys.modules, "rcirl_jax.features", None)
-    for name in ("features", "columns"):
+    for name in ("features", "columns", "units"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     return importlib.import_module("features")
 

@@ -1,5 +1,6 @@
 """The worked example of docs/own_planner.md: a stranger's folder, and its C++ twin."""
 
+import inspect
 import os
 import shutil
 import subprocess
@@ -10,7 +11,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from rcirl_jax import Body, Car, CentreLine, load_weights, scene_from
+from rcirl_jax import Body, Car, CentreLine, load_weights, scene_from, units
 from rcirl_jax.export import reader
 from rcirl_jax.export.own_planner import features
 from rcirl_jax.export.own_planner.builder import plain_scene
@@ -27,8 +28,9 @@ def stranger(tmp_path_factory):
     """A folder with the files and the program, and where only two packages are."""
     folder, packages = (tmp_path_factory.mktemp(name) for name in ("own", "packages"))
     program = ONBOARD / "example" / "own_planner.py"
-    for file in (features.__file__, columns.__file__, reader.__file__, program):
-        shutil.copy(file, folder)
+    for module in (features, columns, units, reader):
+        shutil.copy(inspect.getfile(module), folder)
+    shutil.copy(program, folder)
     for package in (np, msgpack):
         place = Path(package.__file__).parent
         for item in place.parent.glob(f"{place.name}*"):  # its shared libraries too

@@ -6,6 +6,7 @@ that a drive takes does not grow with its length. The same rows become the ego's
 the spans in which nobody drove by hand, and the tracks of the others.
 """
 
+import abc
 import array
 import copy
 import dataclasses
@@ -45,7 +46,17 @@ MAX_ROWS = 5_000_000  # obstacle states held at once
 Row = tuple[float, ...]
 
 
-class Drive:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Window:
+    """What a window's lanes and lights are made for."""
+
+    tracks: Sequence[Track]  # around the origin
+    within: tuple[float, float]  # s, when scenes begin
+    # x, y [n] m of all samples, and the origin [2] m
+    places: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+class Drive(abc.ABC):
     """One drive: rows by role while windows still need them, and its recordings.
 
     Column 0 of a row is its time [s] by the message's stamp. Besides it has a row of
@@ -83,9 +94,9 @@ class Drive:
 
     # ---------------------------------------------------------- what formats say
 
+    @abc.abstractmethod
     def rows(self) -> Iterator[tuple[str, float, float, Row]]:
         """Yields (role, s of recording, share of the drive that is read, row)."""
-        raise NotImplementedError
 
     def stamps(self, role: str) -> np.ndarray:
         """Returns the time [n] s of each row of a role, on the drive's one clock."""
@@ -110,20 +121,9 @@ class Drive:
         """Returns the obstacles [n, columns] that become tracks, times by `clock`."""
         return table, []
 
-    def surroundings(
-        self,
-        tracks: Sequence[Track],
-        within: tuple[float, float],
-        places: tuple[np.ndarray, np.ndarray, np.ndarray],
-    ) -> tuple[dict[str, Any], list[str]]:
-        """Makes fields of the recording besides its tracks, with notes.
-
-        Args:
-          tracks: around the origin.
-          within: s, when scenes begin.
-          places: x, y [n] m of all samples, and the origin [2] m.
-        """
-        lanes, note = fitted_lanes(tracks, self.spec)
+    def surroundings(self, window: "Window") -> tuple[dict[str, Any], list[str]]:
+        """Makes fields of the recording besides its tracks, with notes."""
+        lanes, note = fitted_lanes(window.tracks, self.spec)
         return {"lanes": lanes}, [f"{self.has_no_map}; {note}"]
 
     # --------------------------------------------------------------- rows, clock
@@ -275,7 +275,8 @@ class Drive:
         if not any(t.t[0] < within[1] and t.t[-1] >= within[0] for t in tracks):
             return None
         x, y, origin, tracks = placed(tracks)
-        fields, more = self.surroundings(tracks, within, (x, y, origin))
+        window = Window(tracks=tracks, within=within, places=(x, y, origin))
+        fields, more = self.surroundings(window)
         clock, by_hand = self.clock("driver"), self.tables["driver"][:, 1]
         inside = by_hand[(clock >= within[0]) & (clock < within[1])]
         if inside.size and not inside.all():

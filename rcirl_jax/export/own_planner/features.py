@@ -1,8 +1,8 @@
 """The feature map F from plain numbers, float32. Needs numpy only.
 
-This file and `rcirl_jax/features/columns.py`, the package's own F, may be copied into a
-planner's repository, beside `reader.py`. docs/own_planner.md describes the structs and
-docs/features.md every column.
+This file, the package's own F (`rcirl_jax/features/columns.py`) and the constants
+(`rcirl_jax/units.py`) may be copied into a planner's repository, beside `reader.py`.
+docs/own_planner.md describes the structs and docs/features.md every column.
 
     scene = Scene(ego=Ego(...), path=Path(...), obstacles=[Obstacle(...), ...])
     columns = FeatureMap(reward.names, reward.units)
@@ -22,14 +22,16 @@ from typing import Any, NoReturn
 import numpy as np
 
 try:
+    from rcirl_jax import units
     from rcirl_jax.features import columns as f
-except ImportError:  # both files were copied
+except ImportError:  # the files were copied
     import columns as f  # pyright: ignore[reportMissingImports]
+    import units  # pyright: ignore[reportMissingImports]
 
 Array = np.ndarray  # float32 unless said otherwise
-HORIZON_S, NUM_TIMES, TIMES_S = f.HORIZON_S, f.NUM_TIMES, f.TIMES_S
-STATION_STEP_M, NUM_STATIONS = f.STATION_STEP_M, 128  # m between stations; P
-Kind = f.Kind
+HORIZON_S, NUM_TIMES, TIMES_S = units.HORIZON_S, units.NUM_TIMES, units.TIMES_S
+STATION_STEP_M, NUM_STATIONS = units.STATION_STEP_M, units.NUM_STATIONS
+Kind = units.Kind
 BOX = ("s_lower", "s_upper", "l_lower", "l_upper", "speed", "valid")  # [T] each
 
 # unit of every column

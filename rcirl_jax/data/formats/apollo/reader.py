@@ -29,7 +29,7 @@ from google.protobuf.message import DecodeError
 
 from rcirl_jax.data.formats.apollo.records import Record, Run, check_size, first_parts
 from rcirl_jax.data.formats.files import log_name
-from rcirl_jax.data.formats.messages import Drive, Row, topics_of
+from rcirl_jax.data.formats.messages import Drive, Row, Window, topics_of
 from rcirl_jax.data.formats.options import one_pattern
 from rcirl_jax.data.formats.perception import UNKNOWN
 from rcirl_jax.data.readers.protobuf import Message, parsers
@@ -307,18 +307,15 @@ class ApolloDrive(Drive):
             notes.append("no perception recorded; obstacles are those of prediction")
         return table[seen], notes
 
-    def surroundings(
-        self,
-        tracks: Sequence[Track],
-        within: tuple[float, float],
-        places: tuple[np.ndarray, np.ndarray, np.ndarray],
-    ) -> tuple[dict[str, Any], list[str]]:
+    def surroundings(self, window: Window) -> tuple[dict[str, Any], list[str]]:
         """Makes lanes of the paths, and legs of the ego's track."""
-        fields, notes = super().surroundings(tracks, within, places)
+        fields, notes = super().surroundings(window)
         legs = self._legs()
-        fields["tracks"] = tuple(_with_destinations(tracks, legs, places[2]))
+        fields["tracks"] = tuple(
+            _with_destinations(window.tracks, legs, window.places[2])
+        )
         fields["group"] = self.run.drive if self.run.is_cut else None
-        is_routed = any(start < within[1] and place for start, place in legs)
+        is_routed = any(start < window.within[1] and place for start, place in legs)
         if len(self.tables["ego"]) and not is_routed:
             notes.append("no routing recorded; the ego's destination is unknown")
         if not self._is_one_clock:

@@ -11,14 +11,14 @@ quaternions may be unset, headings have no sign, boxes may be polygons; percepti
 speak in the ego's own frame; a drive may be the planner's own, not a human's.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rcirl_jax.data.formats.files import log_name
-from rcirl_jax.data.formats.messages import MAX_GAP_S, Drive, Row, topics_of
+from rcirl_jax.data.formats.messages import MAX_GAP_S, Drive, Row, Window, topics_of
 from rcirl_jax.data.formats.options import section
 from rcirl_jax.data.formats.ros2.bag import (
     Topic,
@@ -38,7 +38,7 @@ from rcirl_jax.data.formats.ros2.map import (
 from rcirl_jax.data.formats.ros2.messages import LEFT_OUT, TYPES, WIDTHS, Context
 from rcirl_jax.data.readers.reading import reading
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Recording, Track
+from rcirl_jax.types import Recording
 
 # m; Autoware's sample_vehicle (vehicle_info.param.yaml): overhangs 1.0 and 1.1, wheel
 # base 2.79, tread 1.64 and 0.128 on either side
@@ -230,21 +230,16 @@ class BagDrive(Drive):
         )
         return np.delete(table, lost, axis=0), [words] if lost.size else []
 
-    def surroundings(
-        self,
-        tracks: Sequence[Track],
-        within: tuple[float, float],
-        places: tuple[np.ndarray, np.ndarray, np.ndarray],
-    ) -> tuple[dict[str, Any], list[str]]:
+    def surroundings(self, window: Window) -> tuple[dict[str, Any], list[str]]:
         """Takes lanes of the given map, else of the paths, and places the lights."""
         if self.given is None:
-            fields, notes = super().surroundings(tracks, within, places)
+            fields, notes = super().surroundings(window)
             lanes = fields["lanes"]
         else:
-            lanes, notes = lanes_near(self.given[0], *places), self.given[1]
-        near = {name: points - places[2] for name, points in self.lights.items()}
+            lanes, notes = lanes_near(self.given[0], *window.places), self.given[1]
+        near = {name: points - window.places[2] for name, points in self.lights.items()}
         lanes, light_notes = with_stop_lines(lanes, near)
-        clock = np.unique(np.concatenate([track.t for track in tracks]))
+        clock = np.unique(np.concatenate([track.t for track in window.tracks]))
         seen, states = self.clock("lights"), self.tables["lights"][:, 1:]
         signals = signals_of(seen, states, list(self.lights), clock)
         return {"lanes": lanes, "signals": signals}, [*notes, *light_notes]
