@@ -27,7 +27,7 @@ from rcirl_jax.units import Kind as Kind
 
 
 class Decision(enum.IntEnum):
-    """How the human dealt with an obstacle over the whole scene."""
+    """The human's dealing with an obstacle over the whole scene."""
 
     IGNORE = 0
     FOLLOW = 1
@@ -140,7 +140,7 @@ class Candidates(flax.struct.PyTreeNode, kw_only=True):
 
 
 class CandidateInfo(flax.struct.PyTreeNode, kw_only=True):
-    """What losses know about the trajectories of B scenes besides their values."""
+    """The facts about trajectories of B scenes that losses know besides values."""
 
     # m, the positive's mean distance to the recorded human; 0 unless it is the
     # nearest candidate
@@ -226,12 +226,12 @@ class Track:
     leader_missing: tuple[tuple[float, float], ...] = ()
 
     def is_human(self, begin: float, end: float) -> bool:
-        """Whether a human drove all the time from begin to end [s]."""
+        """True if a human drove all the time from begin to end [s]."""
         return not any(low < end and begin < high for low, high in self.automated)
 
     @property
     def first_seen_s(self) -> float:
-        """When the log first saw it."""
+        """Returns the time [s] at which the log first saw it."""
         return float(self.t[0]) if self.seen_since is None else self.seen_since
 
 

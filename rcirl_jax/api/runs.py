@@ -224,7 +224,7 @@ def _files(weights: Place | Sequence[Place]) -> list[str]:
 
 
 def _each(given: object) -> list:
-    """What may be one or several as a list."""
+    """Returns a list; wraps a single value."""
     return list(given) if isinstance(given, list | tuple) else [given]
 
 

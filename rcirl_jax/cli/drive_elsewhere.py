@@ -57,14 +57,14 @@ _ALSO = flags.DEFINE_list(
 
 
 class _MadeBy(msgspec.Struct):
-    """What is read of an output's made_by.json."""
+    """The fields of an output's made_by.json that are read."""
 
     flags: dict[str, Any]
     weights_sha256: dict[str, str]
 
 
 def _driven_before(made_by: Mapping, fixed: Set[str]) -> Results:
-    """What --also has: rows that rest on weights only where they are the same.
+    """Returns the rows of --also; those of weights only if these are the same.
 
     Raises:
       InputError: it drove elsewhere or for another time.

@@ -429,7 +429,7 @@ def suite(default: str = "full") -> Suite:
 
 
 def idm_left_out(path: str | None) -> str:
-    """What a command says where --tuned_idm names no file; "" where it names one."""
+    """Returns the line for a missing --tuned_idm; "" where it is given."""
     return "" if path else f"left out: {TUNED_IDM_ROW}: --tuned_idm is not given"
 
 

@@ -1,4 +1,4 @@
-"""Which learner chooses most like a human: all on the same frozen candidates.
+"""Compares learners: which chooses most like a human, on the same frozen candidates.
 
     rcirl human-likeness --data=DATASET --output=DIR [--seeds=10]
 

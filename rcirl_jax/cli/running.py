@@ -1,4 +1,4 @@
-"""How a command runs: its help, its flags, one line on bad input, what made it.
+"""The frame of every command: help, flags, one line on bad input, provenance.
 
 `run` is the frame of every main. Bad input, a place that cannot be written and memory
 that is not given end with one line and status 2; a fault of this package with its

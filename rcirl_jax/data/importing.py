@@ -57,7 +57,7 @@ CHANGED = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ImportConfig:
-    """What the manifest records of how a dataset was made."""
+    """The settings of an import, as the manifest records them."""
 
     format: str  # importer, for provenance
     collect: CollectConfig = dataclasses.field(default_factory=CollectConfig)
@@ -71,7 +71,7 @@ class ImportConfig:
 
     @property
     def leaves_out(self) -> bool:
-        """Whether any recording may be refused and left out."""
+        """True if any recording may be refused and left out."""
         return self.leave_out > 0 or self.leave_out_share > 0.0
 
     def as_dict(self) -> dict:

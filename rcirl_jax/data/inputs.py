@@ -1,4 +1,4 @@
-"""What an import reads: input files, time slices of long ones, and their recordings."""
+"""The input of an import: files, time slices of long ones, and their recordings."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence

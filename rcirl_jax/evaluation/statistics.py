@@ -63,7 +63,7 @@ class Difference:
 
     @property
     def is_apart(self) -> bool:
-        """Whether the interval leaves out 0."""
+        """True if the interval leaves out 0."""
         return not self.low <= 0.0 <= self.high
 
 

@@ -94,7 +94,7 @@ _IDM = msgspec.defstruct(
 
 
 def score_of(reward: Reward) -> tuple[Score, Ranking]:
-    """What a weights file drives by: V, or its prior cost and V."""
+    """Returns the score of a weights file: V, or its prior cost and V."""
     score = ranking_score(feature_map(str(reward.preset)), reward.activation)
     prior_cost = reward.prior_cost
     if prior_cost is None:
@@ -384,7 +384,7 @@ def judged(
 
 
 def left_out(job: SuiteJob) -> str:
-    """What of the full suite a job leaves out, in words; "" if nothing."""
+    """Says which part of the full suite a job leaves out; "" if none."""
     full = suite_refs("full")
     ours = {dataclasses.replace(ref, seed=0).id for ref in job.refs}  # the same cases
     missing = len({ref.id for ref in full} - ours)

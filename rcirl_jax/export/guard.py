@@ -25,7 +25,7 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Limits:
-    """How far a plan may depart; hashable."""
+    """The limits of a plan's departure from the training range; hashable."""
 
     # scales by which the recorded range of a feature is widened on each side
     margin: float = 0.25
@@ -35,7 +35,7 @@ class Limits:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GuardResult:
-    """What the guard says of one plan."""
+    """The guard's result for one plan."""
 
     in_distribution: bool
     # one with an entry that is not finite, if any; of those the one with the largest

@@ -103,7 +103,7 @@ class WeightsError(ValueError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class PriorCost:
-    """How much of V is added to the incumbent's value, by the scene's familiarity."""
+    """The gain of V on top of the incumbent's value, by the scene's familiarity."""
 
     incumbent: str  # whose value V is added to, at most 64 characters
     low: float  # gain where the training data do not reach, >= 0

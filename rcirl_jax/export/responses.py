@@ -1,4 +1,4 @@
-"""How a reward follows each feature: response curves, and prices in physical units.
+"""Responses of a reward to each feature: curves, and prices in physical units.
 
     R_i(u) = mean over scenes of V(x with x_ti = u at all t), minus its value at the
              median of what people drove, over the standard deviation of V among the

@@ -168,7 +168,7 @@ class SweepConfig:
         return list(itertools.starmap(Point, itertools.product(*self.axes.values())))
 
     def shared(self, hidden: Hidden) -> TrainConfig:
-        """What all members of a group share."""
+        """Returns the settings that all members of a group share."""
         reward = dataclasses.replace(self.base.reward, hidden=hidden)
         return dataclasses.replace(self.base, reward=reward)
 
@@ -179,7 +179,7 @@ class SweepConfig:
         return [dataclasses.replace(shared, seed=seed) for seed in range(self.seeds)]
 
     def as_json(self) -> dict:
-        """What decides the result; more trials go on where fewer ended."""
+        """Returns what decides the result; more trials go on where fewer ended."""
         made = json.loads(json.dumps(dataclasses.asdict(self)))
         kept = {n: value for n, value in made.items() if n not in NO_SETTINGS}
         return {**kept, "search": "optuna" if self.trials else "grid"}

@@ -423,7 +423,7 @@ BEFORE_M = 1e6  # m, how far back the ego is taken to be before the first time
 
 
 class Frame(NamedTuple):
-    """What the columns read at one point; all leaves scalars."""
+    """The inputs of the columns at one point; all leaves scalars."""
 
     time: Array  # s
     advance: Array  # m, station since t = 0

@@ -55,7 +55,7 @@ def _half_extent(box: Box, axes_x: jax.Array, axes_y: jax.Array) -> jax.Array:
 
 
 def overlaps(first: Box, second: Box) -> Bool[Array, ""]:
-    """Whether two boxes share a point (touching counts)."""
+    """True if two boxes share a point (touching counts)."""
     return separation(first, second) <= 0.0
 
 
@@ -77,7 +77,7 @@ def contact_interval(
     velocity_x: Float[Array, ""],
     velocity_y: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """When two boxes meet if the second slides past the first without turning.
+    """Returns when two boxes meet if the second slides past the first without turning.
 
     On each of the four separating axes n the signed distance of the centres
     is linear in time, so the boxes overlap on n during an interval:

@@ -1,4 +1,4 @@
-"""Which road users matter most to a human, so that they get a slot first.
+"""Relevance of road users, by which they get slots of a scene.
 
 One rule for the planner's observer (`jax.numpy`) and for scenes cut from logs
 (`numpy`), so that a learner sees the road users that it will see while driving.

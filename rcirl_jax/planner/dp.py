@@ -148,7 +148,7 @@ class DpConfig:
 
 
 class Lattice(flax.struct.PyTreeNode, kw_only=True):
-    """What the recursion reads, made once per scene."""
+    """The tables that the recursion reads, made once per scene."""
 
     c0: jax.Array  # [T, N, F] features at v = 0 (a = j = 0)
     c1: jax.Array  # [T, N, F] their slope by v
@@ -629,7 +629,7 @@ def optimality_gap(
     activation: str,
     lattice: DpConfig = FINE,
 ) -> dict[str, jax.Array]:
-    """How much less the plan `trajectory` is worth than the best plan of the scene.
+    """Returns how much less the plan `trajectory` is worth than the scene's best plan.
 
     Args:
       scene: one scene.

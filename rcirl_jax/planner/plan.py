@@ -1,4 +1,4 @@
-"""What a planner answers to a scene, and how it is followed until the next plan.
+"""The plan that answers a scene, and how it is followed until the next one.
 
 A plan is s(t), v(t), a(t) on the time axis. Until the next planning step the ego
 follows it (`command`), and that step has the rest of it among its candidates

@@ -103,7 +103,7 @@ def lateral_motion(bodies: Bodies, path: Path) -> tuple[jax.Array, jax.Array]:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Following:
-    """How a predicted driver follows; hashable. Fitted to no file: usual values."""
+    """Parameters of a predicted driver's car following; hashable, not fitted."""
 
     idm: Idm = dataclasses.field(
         default_factory=lambda: Idm(acceleration=1.0, braking=2.0)

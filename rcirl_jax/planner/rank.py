@@ -163,7 +163,7 @@ OWN_SCORES: dict[str, Score] = {
 
 
 class Ranking(flax.struct.PyTreeNode, kw_only=True):
-    """What ranks candidates, V_own + gain V_learned; `ranking` makes it."""
+    """The score of candidates, V_own + gain V_learned; `ranking` makes it."""
 
     own: jax.Array  # [] place in OWN_SCORES
     low: jax.Array  # [] gain where nothing is known

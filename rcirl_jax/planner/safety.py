@@ -75,7 +75,7 @@ class SafetyConfig:
 
 
 class Verdict(flax.struct.PyTreeNode, kw_only=True):
-    """What the filter found; all [K]."""
+    """The findings of the filter; all [K]."""
 
     admissible: jax.Array  # bool
     contact_s: jax.Array  # s, first contact with a body; inf if none

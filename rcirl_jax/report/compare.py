@@ -25,7 +25,7 @@ ALWAYS = ("recipe", "data, sha256", "commit")  # settings shown also where all a
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Metric:
-    """How a number is shown."""
+    """The form in which a number is shown."""
 
     title: str
     unit: str

@@ -1,4 +1,4 @@
-"""What an import made of the logs, as one page: counts, drops, labels, scenes.
+"""The page of an import: sites, counts, drops, labels, scenes.
 
 The page is a single file that refers to no other and needs no script: the scenes
 are filtered by radio buttons and style sheets alone.

@@ -1,4 +1,4 @@
-"""What a reward wants, feature by feature: response curves and shares.
+"""Pictures of a reward, feature by feature: response curves and shares.
 
 Contributions split V(human) - V(candidate) over features
 (`evaluation.attribution`). A reward's scale is free, so contributions

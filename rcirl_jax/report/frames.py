@@ -78,7 +78,7 @@ def pick_frames(dataset: Demonstrations, count: int) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DrawnFrame:
-    """What stands in one example-frame figure."""
+    """The content of one example-frame figure."""
 
     picture: Path
     caption: str

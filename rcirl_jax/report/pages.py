@@ -70,7 +70,7 @@ _MEANINGS = {term.lower(): meaning for term, meaning in TERMS.items()}
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Table:
-    """What parts.html makes a table of; every cell that is no `Markup` is escaped."""
+    """A table for parts.html; every cell that is no `Markup` is escaped."""
 
     caption: str
     heads: Sequence[str]

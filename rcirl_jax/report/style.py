@@ -34,7 +34,7 @@ CLASS_COLOURS = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Look:
-    """How one driver or reward is drawn everywhere in a page."""
+    """The look of one driver or reward everywhere in a page."""
 
     colour: str
     dash: tuple[int, ...]  # px on, px off; empty: solid

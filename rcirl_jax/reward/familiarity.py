@@ -1,4 +1,4 @@
-"""How far the recordings reach: a number in (0, 1) for every scene.
+"""Familiarity of a scene with the recordings: a number in (0, 1).
 
     familiarity = sigmoid(out . tanh(z W + b) + c)
     z = clip((f_0 - location) / scale, -5, 5)

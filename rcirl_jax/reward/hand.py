@@ -77,7 +77,7 @@ class LatticeCost:
 
 
 class LatticeTerms(NamedTuple):
-    """What the cost of one trajectory (or of K, last axis) is made of, unweighted."""
+    """The terms of the cost of one trajectory (or of K, last axis), unweighted."""
 
     limit: Float[Array, "t ..."]  # m/s, speed limit where the ego is
     approach: Float[Array, "t ..."]  # m/s, from which it can stop in time; or inf

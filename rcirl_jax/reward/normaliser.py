@@ -54,7 +54,7 @@ def fit_normaliser(features: np.ndarray, feature_map: FeatureMap) -> Normaliser:
 
 
 def varies(rows: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Which features [F] differ from their median in `VARYING_SHARE` of rows [n, F]."""
+    """Returns the features [F] that vary in `VARYING_SHARE` of rows [n, F]."""
     # float32 is what the features are made in
     differs = rows.astype(np.float32) != middle.astype(np.float32)
     return differs.mean(axis=0) >= VARYING_SHARE

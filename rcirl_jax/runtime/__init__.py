@@ -1,4 +1,4 @@
-"""What every program needs: whole files, stages, processes, signals, settings.
+"""Tools of every program: whole files, stages, processes, signals, settings.
 
 Nothing here knows of driving. `atomic_files` writes whole files or none, `pipeline`
 keeps what a run folder has done, `executors` runs pieces in processes or on Ray,

@@ -1,4 +1,4 @@
-"""How XLA compiles long loops on a CPU, how long it takes, and where it is kept."""
+"""Compilation by XLA: options for long loops on a CPU, seconds, and the cache."""
 
 import contextlib
 import functools

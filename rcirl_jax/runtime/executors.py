@@ -1,4 +1,4 @@
-"""Where independent pieces of work run: here, in other processes, on a Ray cluster.
+"""Executors of independent pieces of work: here, in processes, on a Ray cluster.
 
 A piece is an item; `function(item)` yields its results. Every executor gives the
 results of all items in the order of the items, so what comes out does not depend

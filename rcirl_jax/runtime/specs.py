@@ -1,4 +1,4 @@
-"""Where the declarative files are, and how they are read."""
+"""Finds and reads the declarative files."""
 
 import re
 import tomllib

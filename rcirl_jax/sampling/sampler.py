@@ -335,7 +335,7 @@ def _stop(scene: Scene, config: SamplerConfig) -> tuple[jax.Array, ...]:
 
 
 def _in_the_way(scene: Scene) -> jax.Array:
-    """Which obstacles [N, T] are in the way and not behind."""
+    """Returns the obstacles [N, T] that are in the way and not behind."""
     obstacles, ego = scene.obstacles, scene.ego
     lower, upper = obstacles.s_lower, obstacles.s_upper
     at = jax.vmap(jax.vmap(lookup, (None, 0, None)), (None, 0, None))
@@ -551,7 +551,7 @@ def _with_lateral(
 def within_limits(
     scene: Scene, trajectory: Trajectory, config: SamplerConfig
 ) -> jax.Array:
-    """Whether one trajectory respects the vehicle's limits at its valid times.
+    """True if one trajectory respects the vehicle's limits at its valid times.
 
     a in [min, max], |j|, |kappa|, |v^2 kappa| bounded; v >= 0 holds by
     construction. Times outside the scene's mask and t = 0 (given) do not count.

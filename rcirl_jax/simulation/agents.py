@@ -53,7 +53,7 @@ def colours(lines: Lines, time: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def can_stop(v: Any, distance: Any) -> Any:  # noqa: ANN401
-    """Whether 3 m/s^2 stop a driver at speed v m/s within distance m, elementwise.
+    """True where 3 m/s^2 stop a driver at speed v m/s within distance m, elementwise.
 
     Arguments are numbers or arrays, of numpy or JAX.
     """
@@ -63,7 +63,7 @@ def can_stop(v: Any, distance: Any) -> Any:  # noqa: ANN401
 def must_stop(
     lines: Lines, time: jax.Array, distance: jax.Array, v: jax.Array
 ) -> jax.Array:
-    """Whether lights demand a stop of a driver: bool, shape of `distance`.
+    """True where lights demand a stop of a driver; shape of `distance`.
 
     Red always does; yellow where the driver can still stop with 3 m/s^2.
 
@@ -160,7 +160,7 @@ def bodies_of(case: Case, ego: EgoState, state: AgentState) -> Bodies:
 
 
 class Corridor(flax.struct.PyTreeNode, kw_only=True):
-    """What agent i meets when it looks along its heading; all [A, A + 1]."""
+    """The surroundings that agent i meets along its heading; all [A, A + 1]."""
 
     gap: jax.Array  # m between the boxes along i's heading
     ahead: jax.Array  # bool: j's centre lies ahead of i's

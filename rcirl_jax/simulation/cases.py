@@ -38,7 +38,7 @@ def node(kind: type[_T], /, **leaves: Any) -> _T:  # noqa: ANN401
 
 
 class LineKind(enum.IntEnum):
-    """What a stop line demands. Stored in `Lines.kind`."""
+    """The demands of a stop line. Stored in `Lines.kind`."""
 
     NONE = 0  # an empty slot
     LIGHT = 1  # a traffic light with a cycle
@@ -71,7 +71,7 @@ class Lines(flax.struct.PyTreeNode, kw_only=True):
 
 
 class Driver(flax.struct.PyTreeNode, kw_only=True):
-    """How an agent drives by itself: IDM along its heading, MOBIL across lanes."""
+    """The driver model of an agent: IDM along its heading, MOBIL across lanes."""
 
     desired: jax.Array  # [A] m/s, v0 of the IDM
     headway: jax.Array  # [A] s, T
@@ -89,7 +89,7 @@ class Driver(flax.struct.PyTreeNode, kw_only=True):
 
 
 class Script(flax.struct.PyTreeNode, kw_only=True):
-    """What an agent does at given times after its activation.
+    """The actions of an agent at given times after its activation.
 
     Phase p holds from `start[p]` until the next phase starts: the agent drives
     its speed towards `speed[p]` at `rate[p]`, whatever the IDM wants to do
@@ -132,7 +132,7 @@ class Agents(flax.struct.PyTreeNode, kw_only=True):
 
 
 class Perception(flax.struct.PyTreeNode, kw_only=True):
-    """What the planner gets instead of the truth about the agents."""
+    """The errors of the planner's perception of the agents."""
 
     sigma_position: jax.Array  # [] m, noise of s and l, per step and agent
     sigma_speed: jax.Array  # [] 1, relative noise of the speed
@@ -206,7 +206,7 @@ class AgentState(flax.struct.PyTreeNode, kw_only=True):
 
 
 class Seen(flax.struct.PyTreeNode, kw_only=True):
-    """What is perceived of the agents."""
+    """The agents as they are perceived."""
 
     s: jax.Array  # [A] m
     l: jax.Array  # [A] m
@@ -260,7 +260,7 @@ class Record(flax.struct.PyTreeNode, kw_only=True):
 
 
 class Snapshot(flax.struct.PyTreeNode, kw_only=True):
-    """What a picture needs beyond the Record; every leaf gains [S]."""
+    """The state that a picture needs beyond the Record; every leaf gains [S]."""
 
     agents: AgentState
     plan_s: jax.Array  # [T] m, absolute planned stations

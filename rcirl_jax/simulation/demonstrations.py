@@ -60,7 +60,7 @@ DRIVERS = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DriveConfig:
-    """How drives are cut into scenes."""
+    """The settings by which drives are cut into scenes."""
 
     # s of a drive
     duration_s: float = 120.0

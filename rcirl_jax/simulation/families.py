@@ -280,7 +280,7 @@ class _Drawn(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _Agent(msgspec.Struct):
-    """What of an [[agent]] is no expression of `AGENT` or `DRIVER`."""
+    """The keys of an [[agent]] that are no expressions of `AGENT` or `DRIVER`."""
 
     kind: str
     model: str = "lane"
@@ -352,7 +352,7 @@ def family_names() -> tuple[str, ...]:
 
 
 def family_title(name: str) -> str:
-    """What a family is about, in words; the name itself where it is none of ours."""
+    """Returns a family's title; the name itself where it is none of ours."""
     return load_family(name).title if name in family_names() else name
 
 

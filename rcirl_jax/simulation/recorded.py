@@ -169,7 +169,7 @@ def drawn_evenly(
 
 
 def _turn(keys: Sequence) -> np.ndarray:
-    """How often each key was met before, in order."""
+    """Counts how often each key was met before, in order."""
     seen: dict = {}
     turns = []
     for key in keys:

@@ -46,7 +46,7 @@ MAX_DELAY = 10  # steps by which commands may be late
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RolloutConfig:
-    """How a case is driven; hashable. Its manner is data, the rest is static."""
+    """The settings of a rollout; hashable. Its manner is data, the rest is static."""
 
     # steps between two plans: 1 plans at 10 Hz
     plan_every: int = 1
@@ -203,7 +203,7 @@ def _unpacked(packed: Any, cases: Case, snapshots: bool) -> tuple:  # noqa: ANN4
 
 @functools.lru_cache(maxsize=8)
 def _layout(case: Any, kinds: tuple, snapshots: bool) -> tuple[list, Any]:  # noqa: ANN401
-    """What `_packed` packs of a case of leaves of these kinds: leaves, their tree."""
+    """Returns what `_packed` packs of a case of such leaves: leaves, their tree."""
 
     def logged(case: Case) -> tuple[Record, Snapshot | None]:
         world = start(case)

@@ -168,7 +168,7 @@ def recorded_set(drives: HeldOut) -> CaseSet:
 
 
 def rollout_config(row: Row, duration_s: float, plan_every: int) -> RolloutConfig:
-    """How a row drives cases of a duration."""
+    """Returns the rollout's settings for a row and cases of a duration."""
     every = row.plan_every or plan_every
     steps = round(duration_s / STEP_S)
     return RolloutConfig(

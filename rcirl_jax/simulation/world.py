@@ -265,7 +265,7 @@ def contacts(case: Case, ego: EgoState, state: AgentState) -> Contacts:
 
 
 def _straddles(case: Case, ego: EgoState) -> jax.Array:
-    """Whether the ego covers more than one lane or leaves the drivable area."""
+    """True if the ego covers more than one lane or leaves the drivable area."""
     width = case.road.lane_width
     centre = width * jnp.round(ego.l / width)
     reach = 0.5 * (
@@ -276,7 +276,7 @@ def _straddles(case: Case, ego: EgoState) -> jax.Array:
 
 
 def off_road(case: Case, ego: EgoState) -> jax.Array:
-    """How far [m] the farthest corner lies outside the drivable area; >= 0."""
+    """Returns how far [m] the farthest corner lies outside the drivable area; >= 0."""
     reach = 0.5 * (
         case.ego_width * jnp.abs(jnp.cos(ego.heading))
         + case.ego_length * jnp.abs(jnp.sin(ego.heading))
@@ -323,7 +323,7 @@ SEEN = ("s", "l", "heading", "v", "a", "present")  # rows of `World.seen`
 
 
 def visible(state: AgentState) -> jax.Array:
-    """What can be seen of the agents, rows [6, A] in the order of `SEEN`."""
+    """Returns the visible state of the agents, rows [6, A] in the order of `SEEN`."""
     return jnp.stack([getattr(state, name).astype(jnp.float32) for name in SEEN])
 
 
@@ -346,7 +346,7 @@ def perceive(case: Case, world: World) -> Seen:
 
 
 def _bodies(case: Case, world: World, seen: Seen) -> Bodies:
-    """What is perceived of the agents [A], from the ego's station on."""
+    """Returns the perceived agents [A], from the ego's station on."""
     half_s, half_l = jax.vmap(frenet_extent)(
         case.agents.length, case.agents.width, seen.heading
     )
@@ -513,7 +513,7 @@ def _advance_agents(case: Case, world: World) -> tuple[AgentState, jax.Array]:
 def _turns_reactive(
     case: Case, replay: Replay, world: World, ttc: jax.Array
 ) -> jax.Array:
-    """Whether the ego has left its log, or a conflict is near."""
+    """True if the ego has left its log, or a conflict is near."""
     index = jnp.minimum(world.step, replay.ego_s.shape[0] - 1)
     departed = jnp.hypot(
         world.ego.s - replay.ego_s[index], world.ego.l - replay.ego_l[index]

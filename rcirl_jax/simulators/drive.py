@@ -37,7 +37,7 @@ CORRIDOR_MARGIN_M = 0.2  # m beside the ego's width within which a body is ahead
 
 
 class Free(flax.struct.PyTreeNode, kw_only=True):
-    """What is ahead of the front bumper in the ego's corridor; inf: nothing."""
+    """The free way ahead of the front bumper in the ego's corridor; inf: nothing."""
 
     body: jax.Array  # [] m, the rear of the nearest body
     speed: jax.Array  # [] m/s of that body along the road; 0 without one

@@ -28,7 +28,7 @@ FADING_M = 15.0  # m of way in which an offset from the line falls to 1 / e
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View:
-    """What is seen at one moment: the arguments of `scene_from`, and the way so far.
+    """One moment as it is seen: the arguments of `scene_from`, and the way so far.
 
     A line that stays the same should be the same object from view to view: it is
     smoothed once.
@@ -46,7 +46,7 @@ class View:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Move:
-    """What the ego does in the next 0.1 s along its centre line, and means to do then.
+    """The ego's motion in the next 0.1 s along its centre line, and its plan from then.
 
     A simulator that moves the ego takes `way`, `speed` and `acceleration`, one that
     tracks trajectories itself takes `future`.

@@ -50,7 +50,7 @@ from rcirl_jax.train.step import init_state, make_train_step
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Running:
-    """How a run goes about its work; nothing here changes its result."""
+    """The means of a run; nothing here changes its result."""
 
     # "jit", or over the devices of all processes "pmap" or "shard_map"
     parallel: str = "jit"
@@ -122,7 +122,7 @@ def _described(config: TrainConfig, dataset: Demonstrations) -> dict:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainResult:
-    """What a finished run reports."""
+    """The report of a finished run."""
 
     state: TrainState
     epochs: list[dict]  # one summary per epoch of this process

@@ -1,4 +1,4 @@
-"""Where training writes what it sees: JSON lines, trackers, a progress bar."""
+"""Output of training: JSON lines, trackers, a progress bar."""
 
 import contextlib
 import json

@@ -152,7 +152,7 @@ def share_cores(batch_size: int) -> None:
 
 
 def chosen(batch_size: int) -> str:
-    """What "auto" is: all devices where they share a batch evenly, else the first."""
+    """Resolves "auto": all devices where they share a batch evenly, else the first."""
     many = jax.device_count() > 1 and batch_size % jax.device_count() == 0
     return "shard_map" if many or jax.process_count() > 1 else "jit"
 
@@ -198,12 +198,12 @@ def join_processes(
 
 
 def is_first() -> bool:
-    """Whether this process writes what a run writes once."""
+    """True if this process writes what a run writes once."""
     return jax.process_index() == 0
 
 
 def all_stop_after(step: int) -> bool:
-    """Whether a process was told to end (SIGTERM), and all of them stop at this step.
+    """True if a process was told to end (SIGTERM): all of them stop at this step.
 
     Every process calls it after every step.
     """

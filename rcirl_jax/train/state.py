@@ -1,4 +1,4 @@
-"""What training carries: state, batch, configuration."""
+"""State, batch and configuration of training."""
 
 import dataclasses
 import functools
@@ -157,7 +157,7 @@ class TrainConfig:
 
     @property
     def for_features(self) -> "TrainConfig":
-        """What decides candidates, features and facts; all else at its default."""
+        """Returns what decides candidates and features; the rest at its default."""
         return TrainConfig(
             features=self.features,
             # the only loss that asks for densities
@@ -173,12 +173,12 @@ class TrainConfig:
 
     @property
     def for_step(self) -> "TrainConfig":
-        """What decides the program of a step: a state and batches bring the rest."""
+        """Returns what decides a step's program; state and batches bring the rest."""
         return dataclasses.replace(self, seed=0, epochs=1)
 
     @property
     def for_members(self) -> "TrainConfig":
-        """What the members of a sweep share (`train.sweep`)."""
+        """Returns the fields that members of a sweep share (`train.sweep`)."""
         return dataclasses.replace(self, learning_rate=0.5, leaky_rate=0.5, seed=0)
 
     def loss_config(self, leaky_rate: ArrayLike | None = None) -> LossConfig:

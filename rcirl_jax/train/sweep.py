@@ -26,7 +26,7 @@ PROGRAM = "jit(_fit)"  # JAX's name of what `fit` compiles
 
 
 class Members(flax.struct.PyTreeNode, kw_only=True):
-    """What differs between the members of one training; all [M]."""
+    """The settings in which members of one training differ; all [M]."""
 
     seed: jax.Array  # of the initial weights
     learning_rate: jax.Array
@@ -109,7 +109,7 @@ def _fit(
     members: Members,
     config: TrainConfig,
 ) -> Fitted:
-    """What members differ in is not read from `config`: one compile for all."""
+    """Trains members; `config` holds none of their differences: one compile."""
     count = frozen.feasible.shape[0]
     size = min(config.batch_size, count)
     batches = -(-count // size)

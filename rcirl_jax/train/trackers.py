@@ -27,14 +27,14 @@ Setting = str | float | bool  # an integer is a float to type checkers
 
 
 class Writer(Protocol):
-    """Where a run's numbers go besides metrics.jsonl."""
+    """A further place for a run's numbers, besides metrics.jsonl."""
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
         """Numbers of a step, by name; NaN where there was none."""
         ...
 
     def settings(self, values: Mapping[str, Setting]) -> None:
-        """What decides the run, by name; once, before the first step."""
+        """Takes the run's settings by name; once, before the first step."""
         ...
 
     def figure(self, step: int, name: str, figure: "Figure") -> None:

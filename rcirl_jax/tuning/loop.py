@@ -87,7 +87,7 @@ def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
 
 @dataclasses.dataclass
 class Made:
-    """What the stages have made so far."""
+    """The results of the stages so far."""
 
     recorded: Demonstrations | None = None  # what was imported
     verdict: Verdict | None = None

@@ -223,6 +223,6 @@ def fit_prior_cost(
 
 
 def prior_cost_file(run: Run, drives: int) -> Path | None:
-    """Where the prior cost against so many sets of drives lies; None: there is none."""
+    """Returns the file of the prior cost against so many sets of drives, or None."""
     wanted = run.config.prior_cost.wanted
     return run.folder / "prior_costs" / f"{drives}.json" if wanted else None

@@ -39,7 +39,7 @@ SUITE_SEED = 0  # of the catalogue that rewards are judged on
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SimulatedDemonstrations:
-    """How an expert drives the catalogue; [simulated_demonstrations] of a recipe."""
+    """Settings of an expert's drives; [simulated_demonstrations] of a recipe."""
 
     # who drives, one of EXPERTS
     expert: str = "none"
@@ -111,7 +111,7 @@ class PriorCostConfig:
 
     @property
     def wanted(self) -> bool:
-        """Whether there is a prior cost."""
+        """True if there is a prior cost."""
         return self.high > 0.0
 
 

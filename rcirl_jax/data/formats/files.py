@@ -1,4 +1,4 @@
-"""Which files of an input an importer reads."""
+"""The files of an input that an importer reads."""
 
 import collections
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -60,7 +60,7 @@ def given_map(spec: Mapping) -> Path | None:
 
 
 def is_input(folder: Path, file: Path) -> bool:
-    """Whether it is a file that is neither hidden nor left over from unpacking.
+    """True if it is a file that is neither hidden nor left over from unpacking.
 
     Hidden are files of macOS (._NAME), backup copies of editors and the made-up
     scenario of INTERACTION's scripts (.TestScenarioForScripts).
@@ -121,7 +121,7 @@ def table_stem(path: Path) -> str:
 
 
 def is_long_file(path: Path, spec: dict) -> bool:
-    """Whether a file is read in pieces; `long_bytes` of the TOML sets from where.
+    """True if a file is read in pieces; `long_bytes` of the TOML sets from where.
 
     It counts bytes of text; a compressed file counts as several times its size.
     """

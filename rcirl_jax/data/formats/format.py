@@ -1,4 +1,4 @@
-"""What a format declares in its folder, without loading its reader.
+"""The declaration of a format, which loads none of its reader.
 
 Each folder with a `reader` has a `FORMAT` in its `__init__`, which is cheap to import.
 """

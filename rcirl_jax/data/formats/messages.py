@@ -48,7 +48,7 @@ Row = tuple[float, ...]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Window:
-    """What a window's lanes and lights are made for."""
+    """The surroundings that a window's lanes and lights are made for."""
 
     tracks: Sequence[Track]  # around the origin
     within: tuple[float, float]  # s, when scenes begin
@@ -313,7 +313,7 @@ class Drive(abc.ABC):
         return self._tracks(boxes, self._driver_spans())[0]
 
     def _driver_spans(self) -> tuple[tuple[float, float], ...]:
-        """When nobody drove by hand, or nothing was said of it.
+        """Returns the intervals without manual driving, or of unknown mode.
 
         The first mode was in force before; without any the source TOML says who drove.
         """

@@ -116,7 +116,7 @@ def one_pattern(spec: Mapping, default: str) -> str:
 
 
 def is_file_name(text: str) -> bool:
-    """Whether it names one file in a folder, and could."""
+    """True if it names one file in a folder, and could."""
     return text not in ("", ".", "..") and "/" not in text and _is_name(text)
 
 
@@ -125,7 +125,7 @@ def _is_name(text: str) -> bool:
 
 
 def _is_pattern(item: object) -> bool:
-    """Whether pathlib takes it, and it stays inside the input.
+    """True if pathlib takes it, and it stays inside the input.
 
     Each `**` walks all folders below those of the one before it, so it stands once.
     """
@@ -216,7 +216,7 @@ def _type(value: object) -> str:
 
 
 def _is_uniform(values: Sequence) -> bool:
-    """Whether all are of one type and, if lists, as long."""
+    """True if all are of one type and, if lists, as long."""
     forms = {(_type(v), len(v) if isinstance(v, list) else 0) for v in values}
     return len(forms) == 1
 

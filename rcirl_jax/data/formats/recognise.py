@@ -1,4 +1,4 @@
-"""Which format an input is of, where nobody says it: by names of files and columns."""
+"""Recognises the format of an input by names of files and columns."""
 
 import contextlib
 import itertools

@@ -80,7 +80,7 @@ class TimeSlice:
 
     @property
     def label(self) -> str:
-        """What names of recordings end with."""
+        """Returns the end of the recording's name."""
         rest = "" if self.window is None else f".{self.window:02d}"
         return "" if self.is_whole else f"-{self.number:05d}{rest}"
 

@@ -41,7 +41,7 @@ class _Blosc(msgspec.Struct):
 
 
 class _Metadata(msgspec.Struct):
-    """What is read of a .zarray."""
+    """The fields of a .zarray that are read."""
 
     zarr_format: Literal[2]
     shape: _Extent

@@ -1,4 +1,4 @@
-"""How scenes are cut out of recordings, and which written traffic lights are used."""
+"""Settings: how scenes are cut out of recordings, which written lights are used."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
@@ -69,7 +69,7 @@ def signal_checks(verdicts: Mapping[str, str]) -> SignalChecks:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CollectConfig:
-    """How scenes are cut out of recordings."""
+    """The settings by which scenes are cut out of recordings."""
 
     # s, window of the Savitzky-Golay filter on positions
     smoothing_s: float = 4.1

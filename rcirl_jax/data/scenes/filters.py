@@ -1,4 +1,4 @@
-"""Which scenes are kept, and until when: each reason to drop one is counted.
+"""Filters of scenes, and the time they last; each reason to drop one is counted.
 
 A lead vehicle that leaves the recorded region, or whose track ends, is not recorded
 from then on, but the human still reacts to it. What the human does then cannot be

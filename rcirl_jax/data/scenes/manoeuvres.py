@@ -1,4 +1,4 @@
-"""What happened between the human and an obstacle, read from where both were when.
+"""Manoeuvres of the human around an obstacle, by the places of both over time.
 
 Each manoeuvre is something that both boxes did, not a side of a graph:
 
@@ -67,7 +67,7 @@ FIELDS = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Meetings:
-    """Where each obstacle [..., N] is beside the human at each time [..., N, T]."""
+    """The place of each obstacle [..., N] beside the human at each time [..., N, T]."""
 
     seen: np.ndarray  # bool, a body that is recorded, as the human is
     ahead: np.ndarray  # bool, bumper before bumper

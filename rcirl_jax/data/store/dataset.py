@@ -80,7 +80,7 @@ class Manifest(
     forbid_unknown_fields=True,
     rename={"import_flags": "import"},
 ):
-    """What manifest.json says; "import" is called `import_flags` here."""
+    """The content of manifest.json; "import" is called `import_flags` here."""
 
     schema_version: int
     count: Rows  # of all shards

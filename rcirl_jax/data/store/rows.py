@@ -1,4 +1,4 @@
-"""What a row of a dataset is: shape and dtype of every leaf of a Demonstration."""
+"""The rows of a dataset: shape and dtype of every leaf of a Demonstration."""
 
 import dataclasses
 import functools

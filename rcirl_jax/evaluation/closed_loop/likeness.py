@@ -1,4 +1,4 @@
-"""How near a driver stays to the human, in closed loop on held-out recordings.
+"""Distance of a driver to the human, in closed loop on held-out recordings.
 
 Every row drives the same D short cases (`simulation.recorded`) from the human's
 own state along the human's own path. The number that the gate reads is

@@ -47,7 +47,7 @@ BARS = {"CC": "a careful driver", "FSM": "another careful driver"}
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SuiteConfig:
-    """How a suite is driven."""
+    """The settings by which a suite is driven."""
 
     # steps of 0.1 s between two plans
     plan_every: int = 1

@@ -83,7 +83,7 @@ class GateConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Likeness:
-    """How near every row drives to the human, on D held-out recorded drives."""
+    """The distance of every row to the human, on D held-out recorded drives."""
 
     # row name -> [D] >= 0, distance to the human; lower is nearer
     distance: Mapping[str, np.ndarray]

@@ -20,7 +20,7 @@ WORST_FAMILIES = 10  # rows of the terminal table; the JSON has all
 
 
 class Words(NamedTuple):
-    """What a check over all cases is called; the templates take `_numbers`."""
+    """The names of a check over all cases; the templates take `_numbers`."""
 
     title: str
     worse: str  # as what the candidate does

@@ -38,7 +38,7 @@ TEMPERATURE_TOLERANCE = 1e-13  # of its logarithm
 
 @dataclasses.dataclass(frozen=True)
 class Metric:
-    """How a metric of `scene_metrics` is named, printed and judged."""
+    """A metric of `scene_metrics`: name, unit, and which way is better."""
 
     title: str
     unit: str  # "%", "m", "nat" or "1"; values of "%" are stored as shares

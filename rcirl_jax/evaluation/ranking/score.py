@@ -77,7 +77,7 @@ COSTS: dict[type, Callable] = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RankingSetup:
-    """What all scorers share in one evaluation."""
+    """The settings that all scorers share in one evaluation."""
 
     preset: str = "paper21"
     sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)
@@ -102,7 +102,7 @@ class Scored:
 
 
 class Measured(NamedTuple):
-    """How far K candidates of S scenes end from the human."""
+    """The distances at which K candidates of S scenes end from the human."""
 
     feasible: np.ndarray | jax.Array  # [S, K]
     fde: np.ndarray | jax.Array  # [S, K] m at the horizon

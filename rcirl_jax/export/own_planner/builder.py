@@ -69,7 +69,7 @@ PATH = ("kappa", "l", "speed_limit")  # what plain scenes have of a path
 
 
 class Parts(flax.struct.PyTreeNode, kw_only=True):
-    """What is known of one moment before the others' future is predicted; numpy."""
+    """One moment before the others' future is predicted; numpy."""
 
     ego: Ego
     path: Path

@@ -1,4 +1,4 @@
-"""What people give to `scene_from`, and its checks: SI, radians, Cartesian."""
+"""Inputs of `scene_from` and their checks: SI, radians, Cartesian."""
 
 import dataclasses
 import functools

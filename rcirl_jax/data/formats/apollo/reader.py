@@ -129,7 +129,7 @@ def _predicted(message: Message) -> Iterator[tuple[str, Row]]:
 
 
 def _end(message: Message) -> Iterator[tuple[str, Row]]:
-    """Where a route ends, m."""
+    """Returns the end of a route, m."""
     for point in message.routing_request.waypoint[-1:]:
         x, y = point.pose.x, point.pose.y
         if math.isfinite(x) and math.isfinite(y):

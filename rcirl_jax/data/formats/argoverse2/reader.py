@@ -243,7 +243,7 @@ _Bound = Annotated[list[_Point], msgspec.Meta(min_length=2)]
 
 
 class _Segment(msgspec.Struct):
-    """What is read of a lane segment."""
+    """The fields of a lane segment that are read."""
 
     id: int
     lane_type: Literal["VEHICLE", "BUS", "BIKE"]

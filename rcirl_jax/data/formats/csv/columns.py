@@ -1,4 +1,4 @@
-"""What the columns of a user's table mean: the source TOML, and what it leaves open.
+"""The meaning of a table's columns: the source TOML, and what it leaves open.
 
 The TOML says which column is which field, in which unit, with which scale and offset.
 What it does not say is recognised by the columns' names and first cells: ISO times and
@@ -403,7 +403,7 @@ def _field(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class HeadingForm:
-    """How a file's headings become radians counter-clockwise from +x."""
+    """Converts a file's headings to radians counter-clockwise from +x."""
 
     name: str = "ccw_from_x"
     unit: str = "rad"
@@ -417,7 +417,7 @@ class HeadingForm:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Meaning:
-    """How headings, velocities and flags of a file are read."""
+    """The conventions of a file's headings, velocities and flags."""
 
     form: HeadingForm | None = None  # None: no headings, or not to be believed
     flags: Mapping[str, bool] = dataclasses.field(default_factory=dict)
@@ -433,7 +433,7 @@ class Meaning:
         return made
 
     def automated(self, texts: np.ndarray) -> np.ndarray:
-        """Whether an automation drives [n], by the texts of its column."""
+        """True where an automation drives [n], by the texts of its column."""
         names, codes = np.unique(texts, return_inverse=True)
         return np.array([self.flags[name] for name in names.tolist()], bool)[codes]
 
@@ -589,7 +589,7 @@ def _fitting(
 
 
 def is_large(headings: np.ndarray) -> bool:
-    """Whether angles are too large for radians of one turn."""
+    """True if angles are too large for radians of one turn."""
     known = headings[np.isfinite(headings)]
     return bool(np.any(np.abs(known) > 2.0 * math.pi + 0.1))
 

@@ -81,7 +81,7 @@ NEVER_KNOWN = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Suggestion:
-    """What is suggested for a table."""
+    """The suggestion for a table."""
 
     toml: str
     lines: tuple[str, ...]  # for the terminal
@@ -335,7 +335,7 @@ def _understood(path: Path, guess: _Guess) -> tuple[Rows, Meaning, LogColumns]:
 
 
 def _in_words(table: Table, guess: _Guess, notes: Sequence[str]) -> list[str]:
-    """What was recognised and what is not known, a line each."""
+    """Lists what was recognised and what is not known, a line each."""
     columns, layout = guess.columns, table.layout
     found = ["Parquet or Feather" if layout is None else layout.in_words()]
     for field, column in columns.items():
@@ -430,7 +430,7 @@ def _toml_of(path: Path, guess: _Guess, meaning: Meaning) -> str:
 
 @functools.cache
 def _words() -> dict:
-    """What columns of tables are called, of data_specs/column_names.toml."""
+    """Returns the names of columns, of data_specs/column_names.toml."""
     return load_toml(spec_root() / "column_names.toml")
 
 

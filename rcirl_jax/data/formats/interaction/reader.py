@@ -63,7 +63,7 @@ MAX_GAP_MS = 550.0  # ms missing inside one track
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Scene:
-    """What recordings of one file share."""
+    """The fields that recordings of one file share."""
 
     path: Path
     spec: dict
@@ -119,7 +119,7 @@ def parts(path: Path, spec: dict) -> list[Path]:
 
 
 def _is_log(path: Path) -> bool:
-    """Whether a file has a log's name, or its columns under another name."""
+    """True if a file has a log's name, or its columns under another name."""
     if path.name.endswith(LEFT_OUT):
         return False
     if path.name.startswith((VEHICLES, PEDESTRIANS)) or path.stem.endswith(SETS):
@@ -208,7 +208,7 @@ def _find_map(path: Path, spec: dict) -> Path | None:
 
 
 def _is_numbered(one: str, other: str) -> bool:
-    """Whether one of two names is the other with a number behind it."""
+    """True if one of two names is the other with a number behind it."""
     short, long = sorted((one, other), key=len)
     return long.removeprefix(short).isdigit() and not short[-1:].isdigit()
 

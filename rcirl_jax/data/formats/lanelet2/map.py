@@ -85,7 +85,7 @@ def _tags(element: Element) -> dict[str, str]:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Rule:
-    """What a regulatory element says, read once for all its lanelets."""
+    """A regulatory element, read once for all its lanelets."""
 
     subtype: str
     yields: frozenset[str]  # lanelets that have to give way
@@ -195,7 +195,7 @@ def _resample_both(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 class _World:
-    """What a file holds; elements by id.
+    """The elements of a file by id.
 
     Args:
       path: of the file.
@@ -309,7 +309,7 @@ class _World:
         return bool(np.hypot(*gap) <= SEAM_M)
 
     def _gate(self, lanelet: _Lanelet, end: int) -> tuple:
-        """Where a lanelet begins (0) or ends (-1): its two corner points."""
+        """Returns the two corner points at a lanelet's begin (0) or end (-1)."""
         corners = self._line([nodes[end] for nodes in (lanelet.left, lanelet.right)])
         return tuple(np.round(corners.ravel() / SAME_PLACE_M).astype(int))
 

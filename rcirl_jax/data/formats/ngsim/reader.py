@@ -73,7 +73,7 @@ SIZE_M = (4.5, 1.8)  # m, a car
 
 
 def is_log(file: Path, table: Table | None) -> bool:
-    """Whether it is a text of 18 numbers a line, with blanks between them."""
+    """True if it is a text of 18 numbers a line, with blanks between them."""
     del file
     return (
         table is not None
@@ -147,7 +147,7 @@ def _open(path: Path, spec: dict) -> tuple[Table, RowStats]:
 
 
 def _has_stamps(table: Table) -> bool:
-    """Whether Global_Time [ms] is the clock: positive, and not one for all rows.
+    """True if Global_Time [ms] is the clock: positive, and not one for all rows.
 
     The first few MiB of rows tell.
     """
@@ -234,7 +234,7 @@ def _known_sites(
 
 
 class _Survey:
-    """What the Recordings of a site share, from its rows in any portions.
+    """The facts that Recordings of a site share, from its rows in any portions.
 
     Its memory grows with the different values of Local_X, not with the rows.
     """

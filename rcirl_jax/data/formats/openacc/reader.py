@@ -71,12 +71,12 @@ class _Car:
 
     @property
     def known(self) -> np.ndarray:
-        """Whether each sample [n] has a place and a speed."""
+        """True for each sample [n] that has a place and a speed."""
         return np.isfinite(self.x) & np.isfinite(self.y) & np.isfinite(self.speed)
 
 
 def is_log(file: Path, table: Table | None) -> bool:
-    """Whether it is a drive, by several columns of cars, wherever they are named."""
+    """True if it is a drive, by several columns of cars, wherever they are named."""
     del table
     if is_columnar(file) or not _is_drive(file):
         return False
@@ -89,7 +89,7 @@ def is_log(file: Path, table: Table | None) -> bool:
 
 
 def _is_drive(path: Path) -> bool:
-    """Whether a table is a drive, or so damaged that one cannot tell."""
+    """True if a table is a drive, or so damaged that one cannot tell."""
     try:
         lines, header = _first_lines(path)
     except InputError:
@@ -293,7 +293,7 @@ def _blocks(path: Path, spec: dict, stats: RowStats) -> Iterator[Recording]:
 
 
 def _notes(cars: Mapping[int, _Car]) -> list[str]:
-    """Who drove, and how far positions and sizes are from the recorded spacing.
+    """Notes who drove, and how far positions and sizes are from the recorded spacing.
 
     |p_i - p_{i+1}| - (L_i + L_{i+1}) / 2 - IVS_i, the median over all samples
     """

@@ -1,4 +1,4 @@
-"""What stands beside the road of a bag, which holds no map: lanes and lights.
+"""Lanes and lights from beside a bag, which holds no map.
 
 Lanes come from a Lanelet2 map or a table of lines that the source TOML names, else
 from the paths that were driven. Lights stop the lanes nearest to their places.

@@ -1,4 +1,4 @@
-"""How a message of each type becomes rows of numbers, by the role of its topic.
+"""Converts messages of each type to rows of numbers, by the role of the topic.
 
 A new type of message is a function in `TYPES`. Fields are found by name, as the
 definition in the file has them; covariances are not read. Numbers of classes, shapes
@@ -56,7 +56,7 @@ Pose = tuple[float, float, float]  # x, y [m], heading [rad]; NaN: quaternion no
 
 @dataclasses.dataclass(kw_only=True)
 class Context:
-    """What a message is read with."""
+    """The context that a message is read in."""
 
     where: str = ""  # file, topic and number of the message, for errors
     map_frame: str

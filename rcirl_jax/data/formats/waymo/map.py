@@ -246,7 +246,7 @@ def _neighbours(heads: Sequence[Message], side: str) -> list[str | None]:
 def _of_lanes(
     heads: Sequence[Message], field: str, names: Sequence[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What lanes repeat in a field: numbers of the lanes [n], int64 [n, names]."""
+    """Returns a repeated field of lanes: numbers of the lanes [n], int64 [n, names]."""
     parts = [getattr(head, field) for head in heads]
     lane = np.repeat(np.arange(len(heads)), [len(part) for part in parts])
     items = itertools.chain.from_iterable(parts)

@@ -32,7 +32,7 @@ Found = tuple[np.ndarray, np.ndarray]  # values [n], whether each is unreadable 
 
 
 def is_texts(column: Any) -> bool:  # noqa: ANN401
-    """Whether a column's type is text."""
+    """True if a column's type is text."""
     types = extra_module("pyarrow").types
     kind = column.type.value_type if types.is_dictionary(column.type) else column.type
     return types.is_string(kind) or types.is_large_string(kind)

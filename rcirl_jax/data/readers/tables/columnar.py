@@ -22,7 +22,7 @@ PARQUET, FEATHER, OLD_FEATHER = b"PAR1", b"ARROW1", b"FEA1"
 
 
 def is_columnar(path: Path) -> bool:
-    """Whether the first bytes are those of Parquet or Feather."""
+    """True if the first bytes are those of Parquet or Feather."""
     return first_bytes(path).startswith((PARQUET, FEATHER, OLD_FEATHER))
 
 

@@ -1,4 +1,4 @@
-"""What becomes of a table's rows: counted, dropped where they cannot be true.
+"""Counts a table's rows, and drops those that cannot be true.
 
 A row is dropped if it cannot be read, repeats another, or puts a road user in two
 places at once or far from its track. `RowStats` counts them, and refuses a file of too
@@ -143,7 +143,7 @@ def drop_duplicates(
     codes = ids if ids.dtype.kind == "f" else np.unique(ids, return_inverse=True)[1]
 
     def is_again(order: np.ndarray) -> np.ndarray:
-        """Whether each but the first row is of the user and frame of the one before."""
+        """True for each later row of the user and frame of the one before."""
         return (np.diff(codes[order]) == 0) & (np.diff(clock[order]) == 0.0)
 
     def drop(why: str, found: np.ndarray, what: str) -> None:
@@ -194,7 +194,7 @@ def drop_duplicates(
 
 
 def is_far(dt: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Whether one road user cannot cover a distance [m] in a time [s], [n] each."""
+    """True where one road user cannot cover a distance [m] in a time [s], [n] each."""
     return distance > np.maximum(FAR_M, FASTEST_MPS * dt)
 
 

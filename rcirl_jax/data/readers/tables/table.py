@@ -82,7 +82,7 @@ class Table:
 
     @property
     def unit(self) -> str:
-        """What rows are counted by."""
+        """Returns the unit that rows are counted by."""
         return "row" if self.layout is None else "line"
 
     @functools.cached_property
@@ -100,7 +100,7 @@ class Table:
         return self._places.get(column) or self._places.get(column.casefold(), [])
 
     def has(self, column: str) -> bool:
-        """Whether there is a column of this name; its case does not matter."""
+        """True if there is a column of this name; its case does not matter."""
         return bool(self._found(column))
 
     def place(self, column: str) -> int:

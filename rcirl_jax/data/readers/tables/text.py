@@ -71,7 +71,7 @@ OPTIONS: dict[str, tuple[type, str, Callable[[Any], bool]]] = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Layout:
-    """How the text of a table is written."""
+    """The layout of a table's text."""
 
     encoding: str
     delimiter: str
@@ -201,7 +201,7 @@ def _options(path: Path, section: Mapping) -> dict[str, Any]:
 
 
 def _are_units(rows: Sequence[Sequence[str]], width: int) -> bool:
-    """Whether the first row says the units of columns: words where others count."""
+    """True if the first row says the units of columns: words where others count."""
     if len(rows) < 3 or len(rows[0]) != width:
         return False
     words = 0
@@ -234,7 +234,7 @@ def cells_of(lines: Sequence[str], delimiter: str, quote: str) -> list[list[str]
 
 
 def _delimiter(lines: Sequence[str], quote: str) -> str:
-    """What cuts most lines into as many cells as most others; blanks at last.
+    """Returns what cuts most lines into equally many cells; blanks at last.
 
     Spreadsheets say it in a first line `sep=;`.
     """
