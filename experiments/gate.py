@@ -4,7 +4,7 @@ r"""Judges whether a candidate may replace the incumbent; exit status 0 only to 
         --data=DATASET --output=verdict.json \
         --flagfile=experiments/flagfiles/gate_full.flags
 
-Both drive the same closed-loop cases; never is a learned reward the judge. The margins
+Both drive the same closed-loop cases; no learned reward judges. The margins
 are those of docs/gate.md; `rcirl gate` has a flag for each.
 """
 

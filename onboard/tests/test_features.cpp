@@ -178,7 +178,7 @@ void test_faults_have_one_line() {
              "w: features[4]: station: ft: expected m");
   rcirl::Reward reward;
   CHECK_TEXT(rcirl::feature_map(reward, &map).message(),
-             ": times: others: expected 8 i / 17 s, i = 0 .. 17");
+             ": times: another grid: expected 8 i / 17 s, i = 0 .. 17");
 }
 
 void test_the_mask_says_which_times_count() {

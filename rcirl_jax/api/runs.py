@@ -148,12 +148,12 @@ def gate(
 ) -> Verdict:
     """Judge whether a candidate may replace the incumbent.
 
-    Both drive the same cases; never is a learned reward the judge (docs/gate.md).
+    Both drive the same cases; no learned reward judges (docs/gate.md).
 
     Args:
       candidate: weights file.
       incumbent: weights file, or a baseline's name.
-      data: datasets whose held-out drives say how near to people it drives; without
+      data: datasets whose held-out drives measure its distance to people; without
         any that is not measured, and nothing ships.
       suite: as `simulate`; nothing ships on a part of "full".
       cases: as `simulate`.
@@ -260,7 +260,7 @@ def tune(
       suite: cases of the closed loop: "full", "smoke", or families with commas.
       cases: of each family; None: as declared.
       duration_s: s of a case; None: 120, of "smoke" 20.
-      drives: held-out recorded drives that say how near to people it drives.
+      drives: held-out recorded drives that measure its distance to people.
       executor: where pieces of work run, of `rcirl_jax.runtime.executors`; None: here.
       **settings: as `train_reward`.
 

@@ -3,7 +3,7 @@
     rcirl gate --candidate=FILE --incumbent=FILE --data=DATASET --output=verdict.json
     rcirl gate --candidate=FILE --incumbent=hand-set --output=verdict.json
 
-Both drive the same closed-loop cases; never is a learned reward the judge. Refused (3)
+Both drive the same closed-loop cases; no learned reward judges. Refused (3)
 if the candidate has more cases with a fault than the incumbent, if rates or progress
 are worse than the margins allow, if a family loses, if it is behind rewards that know
 nothing or farther from the human, or if nothing is better. 2: could not judge: bad

@@ -2,7 +2,7 @@
 
     rcirl inspect --data=DATASET --output=FOLDER
 
-Writes FOLDER/index.html, one file to send round, and FOLDER/scenes/*.png: the
+Writes FOLDER/index.html, one file that can be mailed, and FOLDER/scenes/*.png: the
 scene from above, its station-time graph and the human's speed, with the labels.
 Scenes are chosen over all tags, or by --tags or --rows. Takes half a second each.
 Needs the extra [report].

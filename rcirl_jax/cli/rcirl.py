@@ -41,7 +41,7 @@ HEAD = """Learn a motion planner's reward from recorded human driving.
 """
 TAIL = """
 --flagfile=FILE reads flags from a file, one a line. Bad input ends with one line and
-status 2, SIGTERM and Ctrl-C with 143 and 130: the same command again goes on."""
+status 2, SIGTERM and Ctrl-C with 143 and 130: run the same command to go on."""
 HELP = ("help", "-h", "-help", "--help", "--helpfull", "--helpshort")
 
 

@@ -246,7 +246,7 @@ def format_quality(report: dict) -> str:
             lines.append(f"{label:<28}{values:>20}")
     if report["shortened"]:
         share = f"{report['shortened']:,} ({report['shortened_share']:.1%} of times)"
-        lines.append(f"{'end with surroundings':<28}{share:>20}")
+        lines.append(f"{'cut short by others':<28}{share:>20}")
     lines.append("")
     lines.append("tags                  scenes  share   dropped because")
     tags = sorted(report["tags"].items(), key=lambda item: -item[1])
@@ -292,7 +292,7 @@ def oddities(report: Mapping) -> list[str]:
             for what, whole in wholes
             if counts.get(what)
         ]
-        lines.append(f"assumed, for the log does not say it: {', '.join(parts)}")
+        lines.append(f"assumed, as the log does not say: {', '.join(parts)}")
     lines += [f"note: {note}" for note in report["notes"][:NOTES_SHOWN]]
     if report["num_notes"] > NOTES_SHOWN:
         lines.append(f"{report['num_notes']} notes in all: manifest.json")

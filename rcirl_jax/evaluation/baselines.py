@@ -214,15 +214,15 @@ def idm_of(vector: Float[Array, " d"]) -> Idm:
     return dataclasses.replace(usual, **changed)
 
 
-def _cost_terms(scene: Scene, everyone: Trajectory, mask: jax.Array) -> LatticeTerms:
+def _cost_terms(scene: Scene, candidates: Trajectory, mask: jax.Array) -> LatticeTerms:
     cut = scene.replace(time_valid=mask)
-    return jax.vmap(lambda x: lattice_terms(cut, x))(everyone)
+    return jax.vmap(lambda x: lattice_terms(cut, x))(candidates)
 
 
 def _nearness(known: tuple, driver: Idm, on_path: bool) -> jax.Array:
-    scene, everyone, mask = known
+    scene, candidates, mask = known
     way = idm_trajectory(scene, on_path, driver)
-    return jax.vmap(lambda x: closeness(x, way, mask))(everyone)
+    return jax.vmap(lambda x: closeness(x, way, mask))(candidates)
 
 
 HAND_SET = Tunable(

@@ -15,7 +15,7 @@ line are small; the obstacle's own tilt is already in its extents). Source of
 the classes: the paper's Table I and Apollo's per-point rule (stop test and
 time axis corrected).
 
-Three habits make this fast where it counts, on [T, K] grids of candidates:
+Three rules make this fast where it counts, on [T, K] grids of candidates:
 
 * whatever depends on obstacle and time alone is folded into the obstacle
   first (`slots`): its box grows by the ego's half extents, so the ego becomes
@@ -27,8 +27,8 @@ Three habits make this fast where it counts, on [T, K] grids of candidates:
   place: carrying both through one pass takes three times the instructions.
 
 A lookup on the path costs a gather of two neighbours, and a CPU pays for every number
-that it gathers. What is read together stands in one table; XLA drops a table that
-nobody reads.
+that it gathers. What is read together stands in one table; XLA drops an
+unused table.
 """
 
 from collections.abc import Callable
@@ -418,7 +418,7 @@ def relate(
     )
 
 
-MIN_COLLISION_M = -10.0  # m, deepest penetration told apart
+MIN_COLLISION_M = -10.0  # m, largest penetration reported
 BEFORE_M = 1e6  # m, how far back the ego is taken to be before the first time
 
 

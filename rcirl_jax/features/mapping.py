@@ -60,9 +60,9 @@ def _grid(scene: Scene, trajectory: Trajectory, view: PathView) -> Frame:
         one = jax.vmap(relate, in_axes=(None, 0, 0, 0, 0))
         return jnp.broadcast_to(time, s.shape), one(obstacles, s, *rest)
 
-    everyone = slots(scene.ego, scene.obstacles)
+    obstacle_slots = slots(scene.ego, scene.obstacles)
     time, relations = jax.vmap(row)(
-        jnp.asarray(TIMES_S), everyone, s, trajectory.l, trajectory.v, before
+        jnp.asarray(TIMES_S), obstacle_slots, s, trajectory.l, trajectory.v, before
     )
     return Frame(
         time=time,

@@ -112,7 +112,7 @@ class Following:
     memory: float = 2.0
     # s, shortest headway; one below the IDM's is taken for the driver's own
     shortest_headway: float = 0.4
-    # 1, share of the limit at the ego that everybody wants to drive at least
+    # 1, least desired speed, as a share of the limit at the ego
     limit_share: float = 0.8
     # m/s^2 below which braking is taken to go on until standing
     hard_braking: float = -2.0

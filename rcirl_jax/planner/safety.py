@@ -27,7 +27,7 @@ from rcirl_jax.types import Candidates, Kind, Scene, Trajectory
 from rcirl_jax.units import DT_S, TIMES_S
 
 MOVING_MPS = 1.0  # m/s, above which a body's prediction is uncertain
-CROSSING_MPS = 1.0  # m/s, sideways speed above which a body crosses and leads nobody
+CROSSING_MPS = 1.0  # m/s, sideways speed above which a body is no lead vehicle
 
 
 TRACKS = ("full", "collision")

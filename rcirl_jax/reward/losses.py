@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from rcirl_jax.types import CandidateInfo
 
-MARGIN_CEILING_M = 10.0  # m, distance beyond which the hinge asks for no more
+MARGIN_CEILING_M = 10.0  # m, distance at which the margin of the hinge saturates
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

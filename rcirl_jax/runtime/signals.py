@@ -66,13 +66,13 @@ def _end_in_time(read: int) -> None:
     while select.select([read], [], [], max(deadline - time.monotonic(), 0.0))[0]:
         if os.read(read, 1)[0] == signal.SIGINT:
             break
-    leave(number, "while it computed; ")
+    leave(number, "in the middle of a computation; ")
 
 
 def leave(number: int, why: str = "") -> NoReturn:
     """Prints one line and ends now; workers see their parent gone and end as well."""
     name = signal.Signals(number).name
-    line = f"stopped by {name}: {why}run the same command again to go on\n"
+    line = f"stopped by {name}: {why}the same command goes on from here\n"
     with contextlib.suppress(OSError, ValueError):
         sys.stdout.flush()
         sys.stderr.write(line)

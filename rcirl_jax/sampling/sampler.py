@@ -164,9 +164,9 @@ def _pairs(config: SamplerConfig) -> tuple[np.ndarray, np.ndarray]:
     centre; every `lateral_stride`-th with each further lateral profile.
     """
     num_speed = _speed_families(config).size
-    everyone = np.arange(num_speed)
-    strided = everyone[:: config.lateral_stride]
-    pairs = [(i, m) for m in (0, 1) for i in everyone]
+    every_profile = np.arange(num_speed)
+    strided = every_profile[:: config.lateral_stride]
+    pairs = [(i, m) for m in (0, 1) for i in every_profile]
     rest = range(2, num_lateral(config))
     pairs += [(i, m) for m in rest for i in strided]
     grid = np.array(pairs, np.int32)

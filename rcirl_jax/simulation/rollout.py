@@ -256,7 +256,7 @@ def drive_cases(
     On a CPU a batch that is a multiple of `LANES` runs in groups of that many, else
     all cases at once. With `reduce` the records never leave the device, and on a CPU
     there are snapshots too: so one program serves the suite and the pictures of its
-    cases, and draws the very drives.
+    cases, and plots the same rollouts.
 
     Args:
       policy: who drives.

@@ -125,7 +125,7 @@ def baseline_row(
 
 
 def judges() -> tuple[Row, Row, Row, Row]:
-    """The rows that classify: CC, FSM, IDM and nobody."""
+    """The rows that classify cases: CC, FSM, IDM and constant speed."""
     late = round(REACTION_S / STEP_S)
     careful = {"driver": CAREFUL, "braking_jerk": BRAKING_JERK}
     return (

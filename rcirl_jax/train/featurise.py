@@ -111,8 +111,8 @@ def featurise(
         def join(many: jax.Array, one: jax.Array) -> jax.Array:
             return jnp.concatenate([many, jnp.tile(one, (humans, 1))])
 
-        everyone = jax.tree.map(join, candidates.trajectory, driven)
-        frames = candidate_frames(demonstration.scene, everyone)
+        all_trajectories = jax.tree.map(join, candidates.trajectory, driven)
+        frames = candidate_frames(demonstration.scene, all_trajectories)
         both = jnp.stack(features.of_frames(frames))
         human, rows = both[:, :, sampled].T, both[:, :, :sampled]
         frames = jax.tree.map(lambda x: x[:, :sampled], frames)

@@ -90,7 +90,7 @@ inline Status feature_map(const Reward& reward, FeatureMap* map) {
   for (std::size_t t = 0; same && t < kTimes; ++t) {
     same = std::abs(times[t] - kHorizonS * static_cast<float>(t) / 17.0f) < 1e-4f;
   }
-  if (!same) return Status(reward.file() + ": times: others: expected 8 i / 17 s, i = 0 .. 17");
+  if (!same) return Status(reward.file() + ": times: another grid: expected 8 i / 17 s, i = 0 .. 17");
   return feature_map(reward.features(), reward.file(), map);
 }
 

@@ -75,15 +75,19 @@ HEADS = {
         " {name}"
     ),
     "could not judge": (
-        "Could not judge: on {cases} nothing is worse for certain than with {name}"
+        "Could not judge: on {cases} nothing is shown to be worse than with {name}"
+    ),
+    "promising": "Promising: on {cases} nothing is shown to be worse than with {name}",
+    "too early": (
+        "Too early to tell: on {cases} nothing is shown to be worse than with {name}"
     ),
 }
 # what a reader asks after first: metrics of which a gain in one answers it
 MAIN = {
-    "nearness to people": ("likeness",),
-    "comfort": ("a_station", "j_station"),
-    "progress": ("progress",),
-    "nuPlan's score": ("nuplan",),
+    "nearness to people": {"likeness"},
+    "comfort": {"a_station", "j_station"},
+    "progress": {"progress"},
+    "nuPlan's score": {"nuplan"},
 }
 # kinds in the order of the sentence's losses: faults first, trivial baselines last
 ORDER = ("safety", "families", "no loss", "gain", "likeness", "trivial baselines")
@@ -115,45 +119,36 @@ def sentence(pair: Pair, verdict: Verdict) -> str:
     better.sort(key=lambda c: c.name != "likeness")  # what it is for comes first
     gains = [WORDS[c.name].better.format(**_numbers(c)) for c in better]
     unclear = [c for c in checks if c.kind != "gain" and c.outcome == "open"]
-    if verdict.part and verdict.decision == "could not judge" and not worse:
-        return _of_a_part(pair, verdict, better)
+    cases, decision = f"{verdict.cases:,} cases", verdict.decision
+    label, undecided, rest = "Undecided", [c.title for c in unclear], []
+    if verdict.part and decision == "could not judge" and not worse:
+        # most is open for want of cases: say what was shown, and of the main questions
+        # which were not answered
+        decision = "promising" if better else "too early"
+        for n, check in enumerate(better):
+            if check.lost is None:  # no count of drives
+                _, low, high = _percents(check)
+                gains[n] += f" [{low}, {high}]"
+        names = {c.name for c in better}
+        label = "Not told apart"
+        undecided = [title for title, any_of in MAIN.items() if not names & any_of]
+        rest = [f"{cases} are too few to ship"]
     said = ""
     for details, crawling in DETAILS:
         losses = _listed([_worse(c, pair, crawling) for c in worse], details)
-        head = HEADS[verdict.decision]
-        cases = f"{verdict.cases:,} cases"
+        head = HEADS[decision]
         parts = [head.format(cases=cases, name=name_of(pair), losses=losses)]
         if gains:
             words = "But better" if worse else "Better"
             parts.append(f"{words}: {_listed(gains, details)}")
-        if unclear and not worse:
-            parts.append(f"Undecided: {_listed([c.title for c in unclear], details)}")
+        if undecided and not worse:
+            shown = len(MAIN) if rest else details
+            parts.append(f"{label}: {_listed(undecided, shown)}")
+        parts += rest
         said = ". ".join([*parts, f"Next: {_next(verdict, worse, unclear)}"]) + "."
         if len(textwrap.wrap(said, WIDTH)) <= MAX_LINES:
             return said
     return textwrap.shorten(said, (MAX_LINES - 1) * WIDTH, placeholder=" ...")
-
-
-def _of_a_part(pair: Pair, verdict: Verdict, better: Sequence[Check]) -> str:
-    """Says what a small run did show, what it did not tell apart, and what to do."""
-    cases = f"{verdict.cases:,} cases"
-    shown = []
-    for check in better:
-        _, low, high = _percents(check)
-        words = WORDS[check.name].better.format(**_numbers(check))
-        shown.append(f"{words} [{low}, {high}] %")
-    gained = {check.name for check in better}
-    told = dict.fromkeys(
-        title for title, names in MAIN.items() if not gained.intersection(names)
-    )
-    parts = [f"{'Promising' if shown else 'Too early to tell'}: on {cases} nothing is "]
-    parts[0] += f"worse for certain than with {name_of(pair)}"
-    if shown:
-        parts.append(f"Better: {_listed(shown, 2)}")
-    if told:
-        parts.append(f"Not told apart: {', '.join(told)}")
-    parts.append(f"{cases} are too few to ship. Next: {_next(verdict, [], [])}")
-    return ". ".join(parts) + "."
 
 
 def reason(check: Check) -> str:

@@ -297,17 +297,17 @@ def _score_batch(
             "constant speed": near_to(constant_speed_trajectory(scene, on_path)),
             **{name: valued(x) for name, x in {**usual, **tuned}.items()},
         }
-        everyone = candidates.trajectory
+        ways = candidates.trajectory
         return {
             "features_human": features(scene, human),
             "features": features.of_candidates(scene, candidates),
             "feasible": candidates.feasible,
             "fde": fde,
             "ade": ade,
-            "crash": jax.vmap(crashes)(everyone),
+            "crash": jax.vmap(crashes)(ways),
             "human_crash": crashes(human),
             "time_valid": mask,
-            "values": {name: jax.vmap(f)(everyone) for name, f in baselines.items()},
+            "values": {name: jax.vmap(f)(ways) for name, f in baselines.items()},
             "human_values": {name: f(human) for name, f in baselines.items()},
         }
 
