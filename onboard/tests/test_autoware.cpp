@@ -1,6 +1,8 @@
 // The metric for Autoware's ranker against a stand-in of the ranker: test_autoware WEIGHTS.
 #include <cmath>
+#include <iostream>
 #include <memory>
+#include <sstream>
 #include <string>
 #include <vector>
 
@@ -137,6 +139,54 @@ void test_what_cannot_be_valued(const char* weights) {
   CHECK(data->metric(1) == std::vector<float>(82, 0.0f));
 }
 
+// A polygon and a cylinder count as the box that they fill; a polygon's outline stands in
+// the object's frame and need not lie around its place.
+void test_shapes(const char* weights) {
+  const auto made = metric(weights);
+  const auto valued = [&](const stand_in::PredictedObject& object, double a) {
+    const auto data = driven(a);
+    data->objects()->objects = {object};
+    made->evaluate(data, 2.0f);
+    return data->metric(1).front();
+  };
+  const auto box = [](double s, double l, double length, double width) {
+    stand_in::PredictedObject object = other(s, l, 0.0);
+    object.shape.dimensions = {length, width, 1.5};
+    return object;
+  };
+  stand_in::PredictedObject polygon = box(52.0, -0.2, 0.0, 0.0);  // its box's middle: 60, 1.8
+  polygon.shape.type = stand_in::Shape::POLYGON;
+  polygon.shape.footprint.points = {
+      {2.0f, 0.5f, 0.0f}, {14.0f, 1.0f, 0.0f}, {13.0f, 3.5f, 0.0f}, {3.0f, 2.0f, 0.0f}};
+  stand_in::PredictedObject cylinder = box(60.0, 1.8, 3.0, 0.0);
+  cylinder.shape.type = stand_in::Shape::CYLINDER;
+  for (const double a : {-1.4, 0.0, 0.5}) {
+    CHECK(std::abs(valued(polygon, a) - valued(box(60.0, 1.8, 12.0, 3.0), a)) < 1e-5f);
+    CHECK(std::abs(valued(cylinder, a) - valued(box(60.0, 1.8, 3.0, 3.0), a)) < 1e-6f);
+  }
+  CHECK(std::abs(valued(polygon, 0.5) - valued(box(60.0, 1.8, 0.3, 0.3), 0.5)) > 1e-3f);
+  polygon.shape.footprint.points.clear();
+  polygon.shape.dimensions = {4.0, 2.0, 1.5};
+  CHECK(valued(polygon, 0.0) == valued(box(52.0, -0.2, 4.0, 2.0), 0.0));
+}
+
+// The ranker has weights of time for its first six metrics only: said once, of a later one.
+void test_place(const char* weights) {
+  const std::string wanted =
+      "rcirl: metrics.name: RcirlReward at place 8: expected one of the first 6; the ranker "
+      "gives no weight to a later one\n";
+  for (const std::size_t index : {std::size_t{5}, std::size_t{7}}) {
+    const auto made = metric(weights);
+    made->set_index(index);
+    std::ostringstream said;
+    std::streambuf* usual = std::cerr.rdbuf(said.rdbuf());
+    made->evaluate(driven(0.0), 2.0f);
+    made->evaluate(driven(0.5), 2.0f);
+    std::cerr.rdbuf(usual);
+    CHECK_TEXT(said.str(), index < 6 ? "" : wanted);
+  }
+}
+
 }  // namespace
 
 int main(int count, char** arguments) {
@@ -144,5 +194,7 @@ int main(int count, char** arguments) {
   test_values(arguments[1]);
   test_short_candidates(arguments[1]);
   test_what_cannot_be_valued(arguments[1]);
+  test_shapes(arguments[1]);
+  test_place(arguments[1]);
   return failures == 0 ? 0 : 1;
 }

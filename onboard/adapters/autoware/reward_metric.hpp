@@ -1,4 +1,5 @@
-// A learned reward as a metric of Autoware's trajectory ranker (autoware_trajectory_ranker).
+// A learned reward as a metric of Autoware's trajectory ranker (autoware_trajectory_ranker), in
+// the versions whose metrics are given the objects: those in which the ranker is a node.
 //
 // Export it in a package of your own (docs/own_planner.md). The environment variable RCIRL_WEIGHTS names the weights file. With V0 the value of
 // keeping speed and offset, the metric of a candidate is, at all of its points,
@@ -32,6 +33,8 @@ namespace ranker = ::autoware::trajectory_ranker;
 using rcirl::detail::XY;
 
 constexpr double kAroundM = 300.0;  // m from the ego that lanes are looked at
+constexpr double kLeastM = 0.3;     // m, least length and width of an object
+constexpr std::size_t kWeighted = 6;  // metrics with a time_decay_weight, s0 to s5
 
 template <typename Pose>
 double yaw(const Pose& pose) {
@@ -64,6 +67,13 @@ class RewardMetric : public ranker::metrics::MetricInterface {
 
   void evaluate(const std::shared_ptr<ranker::DataInterface>& result,
                 const float max_value) const override {
+    if (index() >= kWeighted && !told_) {
+      told_ = true;
+      RCLCPP_ERROR_STREAM(rclcpp::get_logger("rcirl"),
+                          "metrics.name: " + name() + " at place " + std::to_string(index() + 1) +
+                              ": expected one of the first " + std::to_string(kWeighted) +
+                              "; the ranker gives no weight to a later one");
+    }
     const std::size_t size = result->points()->size();
     const float metric = status_.ok() && size > 1 ? preference(*result, max_value) : 0.0f;
     result->set_metric(index(), std::vector<float>(size, metric));
@@ -167,6 +177,29 @@ class RewardMetric : public ranker::metrics::MetricInterface {
     limits.push_back(limits.back());
   }
 
+  // The sizes of a shape, and the middle of its box. A cylinder has a diameter only; the
+  // outline of a polygon stands in the object's frame, around a place of its own.
+  template <typename Shape>
+  static void box(const Shape& shape, rcirl::Other* made) {
+    double length = shape.dimensions.x, width = shape.dimensions.y;
+    if (shape.type == Shape::CYLINDER) width = length;
+    if (shape.type == Shape::POLYGON && !shape.footprint.points.empty()) {
+      const auto& first = shape.footprint.points.front();
+      double low[2] = {first.x, first.y}, high[2] = {first.x, first.y};
+      for (const auto& point : shape.footprint.points) {
+        const double at[2] = {point.x, point.y};
+        for (int i = 0; i < 2; ++i) {
+          low[i] = std::min(low[i], at[i]), high[i] = std::max(high[i], at[i]);
+        }
+      }
+      length = high[0] - low[0], width = high[1] - low[1];
+      const double ahead = 0.5 * (low[0] + high[0]), left = 0.5 * (low[1] + high[1]);
+      const double cosine = std::cos(made->heading), sine = std::sin(made->heading);
+      made->x += cosine * ahead - sine * left, made->y += sine * ahead + cosine * left;
+    }
+    made->length = std::max(kLeastM, length), made->width = std::max(kLeastM, width);
+  }
+
   template <typename Object>
   static rcirl::Other other(const Object& object) {
     using Label = std::decay_t<decltype(object.classification.front())>;
@@ -174,8 +207,7 @@ class RewardMetric : public ranker::metrics::MetricInterface {
     rcirl::Other made;
     made.x = pose.position.x, made.y = pose.position.y, made.heading = yaw(pose);
     made.speed = object.kinematics.initial_twist_with_covariance.twist.linear.x;
-    made.length = std::max(0.3, object.shape.dimensions.x);
-    made.width = std::max(0.3, object.shape.dimensions.y);
+    box(object.shape, &made);
     float most = -1.0f;
     for (const auto& one : object.classification) {
       if (one.probability <= most) continue;
@@ -191,6 +223,7 @@ class RewardMetric : public ranker::metrics::MetricInterface {
   rcirl::Reward reward_;
   rcirl::FeatureMap columns_;
   rcirl::Status status_;
+  mutable bool told_ = false;  // that its place has no weight
 };
 
 }  // namespace rcirl_autoware

@@ -68,7 +68,18 @@ struct Kinematics {
   TwistWithCovariance initial_twist_with_covariance;
 };
 
+struct Point32 {
+  float x = 0.0f, y = 0.0f, z = 0.0f;
+};
+
+struct Polygon {
+  std::vector<Point32> points;
+};
+
 struct Shape {
+  enum : std::uint8_t { BOUNDING_BOX, CYLINDER, POLYGON };
+  std::uint8_t type = BOUNDING_BOX;
+  Polygon footprint;
   Vector dimensions;
 };
 
