@@ -170,12 +170,14 @@ class RowStore:
         self._held = 0  # bytes of them
         self._given = 0.0  # minutes given as slices
         self._tidied: set[int] = set()
+        self._seconds: set[float] = set()  # in which there are rows
         self._arrays: dict[str, np.ndarray] = {}  # field -> all its texts
 
     def add(self, batch: Batch) -> None:
         """Sorts a batch's rows into their blocks."""
         columns = number_texts(batch, self._texts)
         self._names = list(columns)
+        self._seconds.update(np.unique(np.floor(columns["t"])).tolist())
         rows = np.stack(list(columns.values()), axis=1)
         recording = minute = np.zeros(len(rows), np.int64)
         if "recording" in columns:
@@ -258,6 +260,10 @@ class RowStore:
     def texts_of(self, field: str) -> list[str]:
         """Returns all that a field of texts holds."""
         return list(self._texts.get(field, ()))
+
+    def seconds(self) -> np.ndarray:
+        """Returns the whole seconds [n] in which there are rows, rising, as written."""
+        return np.array(sorted(self._seconds))
 
     def _values(self, rows: np.ndarray) -> Rows:
         """Field -> [n], texts as texts."""

@@ -218,3 +218,83 @@ def test_longitudes_over_the_180th_meridian(tmp_path, first, long_bytes):
     path = people.write(tmp_path, table, header)
     more = f"long_bytes = {long_bytes}"
     people.assert_same(people.only(path, people.spec(tmp_path, columns, more=more)))
+
+
+def as_digits(start, form):
+    """Seconds since a time of day, as digits."""
+
+    def cell(t):
+        moment = start + datetime.timedelta(seconds=round(t, 3))
+        text = moment.strftime(form.replace("%L", f"{moment.microsecond // 1000:03d}"))
+        return str(int(text)) if form == "%-H%M%S%L" else text
+
+    return cell
+
+
+def digits(folder, form, start, unit="", more=""):
+    """(log, source TOML) of the drive at times of day as digits."""
+    clock = as_digits(datetime.datetime(2024, 5, 31, *start), form)
+    path = people.write(folder, people.column(people.rows(), "t", clock))
+    return path, people.spec(folder, units=unit and f't = "{unit}"', more=more)
+
+
+DIGITS = [  # unit, form (%L: milliseconds; a number loses its zeros)
+    ("HHMMSSmmm", "%-H%M%S%L"),
+    ("HHMMSS", "%H%M%S.%L"),
+    ("%Y%m%d%H%M%S%f", "%Y%m%d%H%M%S%L"),
+]
+STARTS = [(8, 4, 54), (8, 59, 54), (23, 59, 54)]
+
+
+@LONG
+@pytest.mark.parametrize(("unit", "form"), DIGITS)
+@pytest.mark.parametrize("start", STARTS)
+def test_times_as_digits(tmp_path, unit, form, start, long_bytes):
+    """A minute ends, an hour ends, a day ends: no hole of 40 s."""
+    found = joined(*digits(tmp_path, form, start, unit, f"long_bytes = {long_bytes}"))
+    assert sorted(found) == [f"car{k}" for k in range(6)]
+    for part in found.values():
+        np.testing.assert_allclose(part[:, 0], np.arange(120) / 10, atol=1e-5)
+
+
+@pytest.mark.parametrize("form", ["%H%M%S%L", "%H%M%S.%L", "%Y%m%d%H%M%S%L"])
+def test_digits_that_can_only_be_times_are_recognised(tmp_path, form):
+    found = people.only(*digits(tmp_path, form, (8, 4, 54)))
+    assert found.start_s % 86400.0 == 8 * 3600 + 4 * 60 + 54
+    people.assert_same(found)
+    assert any(note.startswith("column t: times as ") for note in found.notes)
+
+
+def test_digits_that_may_be_milliseconds_are_not_guessed(tmp_path):
+    line = refused(*digits(tmp_path, "%-H%M%S%L", (8, 4, 54)))
+    assert line.endswith(
+        "units.t: missing: the cells of t are such as '80454000', times of day as "
+        'digits or milliseconds: expected units.t = "HHMMSSmmm" or "ms"'
+    )
+
+
+@LONG
+@pytest.mark.parametrize("unit", ["ms", "s"])
+@pytest.mark.parametrize("start", STARTS)
+def test_a_unit_that_leaves_a_hole_in_each_minute(tmp_path, unit, start, long_bytes):
+    forms = {"ms": ("%-H%M%S%L", "HHMMSSmmm"), "s": ("%-H%M%S.%L", "HHMMSS")}
+    form, right = forms[unit]
+    log, source = digits(tmp_path, form, start, unit, f"long_bytes = {long_bytes}")
+    assert refused(log, source) == (
+        f"{log}: units.t: {unit}: no row has seconds 60 to 99, and those after 59 are "
+        f'of the next minute: expected units.t = "{right}" (times as digits)'
+    )
+
+
+@pytest.mark.parametrize("first", [0, 80_454_000, 1_717_142_694_000, 1_711_111_111_111])
+def test_long_numbers_are_no_times_of_day(tmp_path, first):
+    """Milliseconds since a start, of the day, since 1970: all with holes by a pause."""
+    table = [
+        [first + round(1000 * row[T]) + 31_700 * (row[T] > 5.9), *row[1:]]
+        for row in people.rows()
+    ]
+    path = people.write(tmp_path, table)
+    found = people.only(path, people.spec(tmp_path, units='t = "ms"'))
+    assert found.start_s == pytest.approx(first / 1000)
+    times = np.unique(np.concatenate([track.t for track in found.tracks]))
+    assert (times.size, times[-1]) == (120, pytest.approx(11.9 + 31.7))

@@ -12,6 +12,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml
 from tests.data.formats import people
 from tests.data.formats.test_csv_meaning import pneuma, wide_frames
+from tests.data.formats.test_csv_rows import digits
 from tests.data.formats.test_csv_ways import degrees
 from tests.helpers.commands import command
 
@@ -219,3 +220,27 @@ def test_pixels_and_points_that_are_no_middle_come_last(header, x, unit):
     names = ["frame", "id", *header.split()]
     assert fields_by_name(names)["x"] == x
     assert unit_of(x, ("m", "ft")) == unit
+
+
+@pytest.mark.parametrize(
+    ("start", "unit", "is_open"),
+    [((8, 4, 54), "HHMMSSmmm", False), ((8, 4, 7), "ms", True)],
+)
+def test_times_of_day_as_digits(tmp_path, start, unit, is_open):
+    """Sure where a minute ends in the first rows; else milliseconds, and it says so."""
+    path, _ = digits(tmp_path, "%-H%M%S%L", start)
+    found, toml, (made,) = taken(path)
+    assert toml["units"]["t"] == unit
+    assert toml["defaults"]["rate_hz"] == 10.0
+    line = "not known: units.t: ms, or HHMMSSmmm of times of day?"
+    assert (line in found.lines) == is_open
+    people.assert_same(made)
+
+
+@pytest.mark.parametrize("first", [1_717_142_694_000, 90_061_000])
+def test_milliseconds_are_no_times_of_day(tmp_path, first):
+    table = people.column(people.rows(), "t", lambda t: first + round(1000 * t))
+    found, toml, (made,) = taken(people.write(tmp_path, table))
+    assert toml["units"]["t"] == "ms"
+    assert not any("HHMMSS" in line for line in found.lines)
+    people.assert_same(made)

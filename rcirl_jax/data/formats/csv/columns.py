@@ -24,7 +24,13 @@ import numpy as np
 
 from rcirl_jax.data.formats.options import UNITS, number, one_of, positive, section
 from rcirl_jax.data.formats.projection import projected
-from rcirl_jax.data.readers.tables.cells import EMPTY, ISO
+from rcirl_jax.data.readers.tables.cells import (
+    CLOCK_DIGITS,
+    EMPTY,
+    ISO,
+    day_and_second,
+    times_of_day,
+)
 from rcirl_jax.data.readers.tables.rows import Rows
 from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
@@ -40,7 +46,7 @@ from rcirl_jax.runtime.checked import check_names
 LENGTHS = ("m", "ft", "km", "cm", "mm")
 SPEEDS = ("m/s", "km/h", "mph", "ft/s", "kn")
 ANGLES = ("rad", "deg")
-CLOCKS = ("s", "ms", "us", "ns", "min", "h", "day", "frame", ISO)
+CLOCKS = ("s", "ms", "us", "ns", "min", "h", "day", "frame", ISO, *CLOCK_DIGITS)
 # field of numbers -> its units, and what no log can mean, in the file's unit
 NUMBERS = {
     "t": (CLOCKS, MAX_TIME),
@@ -69,6 +75,14 @@ DATES = ("%d.%m.%Y", "%d.%m.%y", "%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y")
 TIMES_OF_DAY = (
     *("%H:%M:%S.%f", "%H:%M:%S,%f", "%H:%M:%S", "%I:%M:%S.%f %p", "%I:%M:%S %p"),
 )
+DATE = "%Y%m%d%H%M%S"
+# dates and times as digits alone: of 14, 17 or 20, which no clock of Unix has
+DATE_DIGITS = re.compile(
+    r"(19|20)\d\d(0[1-9]|1[0-2])([0-2]\d|3[01])([01]\d|2[0-3])([0-5]\d){2}(\d{3}){0,2}"
+)
+CLOCK_FROM = 1e6  # HHMMSSmmm from 00:10 on; numbers below it are common counters
+HOLE_S = 40.0  # s that digits leave out at the end of a minute, 4040 of an hour
+AT_A_MINUTE_S = 2.0  # s at most between the last row of a minute and the next one
 WORD = r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+"  # of a name in camel case too
 HOLE = "{id}"  # in a column's name: which road user's it is
 # name -> sign and zero [rad]; north is +y
@@ -109,6 +123,7 @@ class LogColumns:
     rate_hz: float
     # latitude and longitude [deg] of the projection's middle; None: x and y are metres
     middle: tuple[float, float] | None = None
+    clock: str = "s"  # unit of t, as the TOML has it
     degrees: float = 1.0  # of latitude and longitude in the file's unit
     heading_unit: str = ""  # rad or deg; "": recognised
     has_units: bool = True  # whether the TOML says the unit of x and y
@@ -153,12 +168,14 @@ def columns_of(table: Table, spec: Mapping) -> LogColumns:
     clock = next(name.lstrip("-") for field, name, _ in found if field == "t")
     form, factor = _time(table, clock, units.get("t"), rate, notes)
     is_clock = bool(re.search("%[HI]", form)) and not re.search("%[djcxU]", form)
+    is_clock |= form in CLOCK_DIGITS
     if form == ISO:
         is_clock = re.match(r"\d{1,2}:\d", first_cell(table, clock)) is not None
     return LogColumns(
         fields=tuple(_field(*one, units, spec, form, factor) for one in found),
         rate_hz=rate,
         middle=middle,
+        clock=form or str(units.get("t", "s")),
         degrees=degrees,
         heading_unit=units.get("heading", ""),
         has_units="x" in section(spec, "units") or middle is not None,
@@ -239,12 +256,66 @@ def sampled(table: Table, column: str) -> np.ndarray:
 
 def date_pattern(cells: Sequence[str]) -> str:
     """Returns the pattern of strptime that all cells have; "" if none is known."""
+    if cells and all(map(DATE_DIGITS.fullmatch, cells)):
+        return DATE + ("%f" if len(cells[0]) > 14 else "")
     for parts in itertools.product(DATES, TIMES_OF_DAY) if cells else ():
         with contextlib.suppress(ValueError):
             for cell in cells:
                 datetime.datetime.strptime(cell, " ".join(parts))
             return " ".join(parts)
     return ""
+
+
+def clock_digits(cells: Sequence[str], values: np.ndarray) -> tuple[str, bool]:
+    """Returns the form of CLOCK_DIGITS that a clock may have, and whether it is sure.
+
+    It is sure of texts with a leading zero, such as 080459920, and where a minute's
+    last row and the next one's first are one step apart as digits only.
+
+    Args:
+      cells: of the first rows, not empty.
+      values: [n] of these or more rows, as numbers.
+    """
+    whole = [re.fullmatch(r"(\d+)([.,]\d*)?", cell) for cell in cells]
+    if not cells or not values.size or not all(whole):
+        return "", False
+    sizes = {len(match[1]) for match in whole if match}
+    is_long = values.max() >= CLOCK_FROM or sizes == {len("HHMMSSmmm")}
+    form = "HHMMSSmmm" if is_long else "HHMMSS"
+    if times_of_day(values, form)[1].any():
+        return "", False
+    is_padded = sizes == {len(form)} and any(cell[0] == "0" for cell in cells)
+    is_padded &= values.max() >= 1e4 * CLOCK_DIGITS[form]  # 01:00 or later
+    return form, is_padded or has_holes(np.unique(values) / CLOCK_DIGITS[form])
+
+
+def has_holes(seconds: np.ndarray) -> bool:
+    """True if rising times [n] s leave 60 to 99 out, as digits of a time of day do."""
+    day, clock = day_and_second(seconds)
+    if not seconds.size or day.any() or np.isnan(clock).any():
+        return False
+    if seconds[0] < 1.0 and seconds[-1] >= 235959.0:  # over midnight
+        return True
+    steps = np.diff(clock)
+    is_hole = np.diff(seconds) - steps >= HOLE_S
+    return bool(np.any(is_hole & (steps <= AT_A_MINUTE_S)))
+
+
+def check_clock(path: Path, seconds: np.ndarray, columns: LogColumns) -> None:
+    """Refuses times of day as digits that were read as numbers.
+
+    Args:
+      path: of the log.
+      seconds: [n] whole seconds in which there are rows, rising.
+      columns: of the log.
+    """
+    if columns.clock in ("s", "ms") and has_holes(seconds):
+        form = [*CLOCK_DIGITS][columns.clock == "ms"]
+        raise InputError(
+            f"{path}: units.t: {columns.clock}: no row has seconds 60 to 99, and those "
+            f'after 59 are of the next minute: expected units.t = "{form}" (times as '
+            "digits)"
+        )
 
 
 def _scaled(field: str, spec: Mapping) -> tuple[float, float]:
@@ -349,11 +420,20 @@ def _time(
     table: Table, name: str, unit: str | None, rate: float, notes: list[str]
 ) -> tuple[str, float]:
     """(form, factor) of the clock; where nothing is said, as its first cells are."""
-    if unit == ISO or (unit is not None and "%" in unit):
+    if unit in (ISO, *CLOCK_DIGITS) or (unit is not None and "%" in unit):
         return unit, 1.0
     first, form = first_cell(table, name), ISO
     if not re.match(ISO_TIMES, first):
         form = date_pattern(known_cells(table, name))
+    if not form and unit is None:
+        form, is_sure = clock_digits(known_cells(table, name), sampled(table, name))
+        if form == "HHMMSSmmm" and not is_sure:
+            raise InputError(
+                f"{table.path}: units.t: missing: the cells of {name} are such as "
+                f"'{first[:40]}', times of day as digits or milliseconds: expected "
+                'units.t = "HHMMSSmmm" or "ms"'
+            )
+        form = form if is_sure else ""
     if not form:
         return "", 1.0 / rate if unit == "frame" else UNITS[unit or "s"]
     if unit is not None:

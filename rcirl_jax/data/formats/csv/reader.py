@@ -18,6 +18,7 @@ import numpy as np
 from rcirl_jax.data.formats.csv.columns import (
     LogColumns,
     Meaning,
+    check_clock,
     columns_of,
     meaning_of,
 )
@@ -131,6 +132,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
             distance=columns.distance,
             is_clock=columns.is_clock,
         ) as rows:
+            check_clock(file, rows.seconds(), columns)
             every = rows.recordings()
             minutes = (log.placed(part) for one in every for part in rows.minutes(one))
             automated = rows.texts_of("automated")

@@ -27,6 +27,7 @@ from rcirl_jax.data.formats.csv.columns import (
     YES,
     LogColumns,
     Meaning,
+    clock_digits,
     date_pattern,
     first_cell,
     half_seconds,
@@ -40,9 +41,10 @@ from rcirl_jax.data.formats.csv.columns import (
 from rcirl_jax.data.formats.csv.reader import PATTERNS, Log, opened
 from rcirl_jax.data.formats.files import table_stem
 from rcirl_jax.data.formats.options import KINDS, UNITS
-from rcirl_jax.data.readers.tables.rows import LINE, Rows
+from rcirl_jax.data.readers.tables.rows import LINE, Rows, RowStats
 from rcirl_jax.data.readers.tables.table import (
     MAX_TIME,
+    Field,
     Table,
     as_texts,
     batches,
@@ -183,6 +185,8 @@ def _guess_time_form(table: Table, guess: _Guess) -> None:
         guess.units["t"] = "ns" if float(first) > 1e3 * MAX_TIME else "us"
     elif pattern := date_pattern(known_cells(table, guess.columns["t"])):
         guess.units["t"] = pattern
+    else:
+        _guess_clock_digits(table, guess)
     found = sampled(table, guess.columns["lat"]) if "lat" in guess.columns else None
     if found is not None and found.size and np.abs(found).min() > DEGREES["y"]:
         raise InputError(
@@ -190,6 +194,22 @@ def _guess_time_form(table: Table, guess: _Guess) -> None:
             "if these are raw numbers, write the TOML by hand, with their [scale], "
             "such as lat = 1e-7, lon = 1e-7"
         )
+
+
+def _guess_clock_digits(table: Table, guess: _Guess) -> None:
+    """Whether digits are times of day, by the rows of the first MiB."""
+    name = guess.columns["t"]
+    field = Field(name="t", column=name)
+    values = next(batches(table, [field], RowStats(table.path, allowed=0.5)))["t"]
+    form, is_sure = clock_digits(known_cells(table, name), values)
+    if is_sure:
+        guess.units["t"] = form
+        guess.said.append(f"units.t = {form}: seconds from 60 to 99 have no rows")
+    elif form == "HHMMSSmmm":
+        guess.units["t"] = (
+            _said_unit(table, "t", guess, ("ms", "us", "ns", "s")) or "ms"
+        )
+        guess.open.append(f"units.t: {guess.units['t']}, or {form} of times of day?")
 
 
 def _usual_rate(rate: float, fits: float) -> float | None:

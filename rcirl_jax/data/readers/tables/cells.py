@@ -26,6 +26,8 @@ NEARLY_ISO = (
     (r"^(\d\d:)", r"1970-01-01 \1"),
 )
 ISO = "iso"  # times as ISO 8601 writes them
+# times of day as digits, with or without leading zeros -> a second in them
+CLOCK_DIGITS = {"HHMMSS": 1.0, "HHMMSSmmm": 1e3}
 EPOCH = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 Found = tuple[np.ndarray, np.ndarray]  # values [n], whether each is unreadable [n]
@@ -107,15 +109,38 @@ def _typed(column: Any) -> np.ndarray:  # noqa: ANN401
     return made * factor
 
 
+def day_and_second(digits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the part [n] of digits above HHMMSS, and s of the day [n] of the rest.
+
+    NaN where the rest is no time of day.
+    """
+    day, rest = np.divmod(digits, 1e6)
+    hours, rest = np.divmod(rest, 1e4)
+    minutes, seconds = np.divmod(rest, 100.0)
+    good = (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0)
+    return day, np.where(good, 3600.0 * hours + 60.0 * minutes + seconds, np.nan)
+
+
+def times_of_day(digits: np.ndarray, form: str) -> Found:
+    """Returns s since midnight [n] of digits such as 80459920; NaN stays NaN.
+
+    Args:
+      digits: [n] as numbers.
+      form: one of CLOCK_DIGITS.
+    """
+    day, seconds = day_and_second(digits / CLOCK_DIGITS[form])
+    return seconds, ~np.isnan(digits) & ((day != 0.0) | np.isnan(seconds))
+
+
 def times(column: Any, form: str) -> Found:  # noqa: ANN401
     """Returns times [n] s since 1970 (UTC where no zone is said), NaN where empty.
 
     Args:
-      column: texts, or times of Parquet's own types.
+      column: texts, digits, or times of Parquet's own types.
       form: `ISO`, or a pattern of Python's strptime.
     """
     arrow, compute = extra_module("pyarrow"), extra_module("pyarrow.compute")
-    if not is_texts(column):
+    if not is_texts(column) and not arrow.types.is_integer(column.type):
         values = _typed(column)
         return values, np.isinf(values)
     cells = _with_none(compute.utf8_trim_whitespace(column.cast(arrow.string())))

@@ -61,7 +61,9 @@ class Field:
     needed: bool = True  # a row without it is none; else empty cells are unknown
     text: bool = False
     lower: bool = False  # text in small letters
-    form: str = ""  # of a time: `cells.ISO` or a pattern of strptime; "": a number
+    # of a time: `cells.ISO`, one of `cells.CLOCK_DIGITS` or a pattern of strptime; "":
+    # a number
+    form: str = ""
     scale: float = 1.0
     offset: float = 0.0
     factor: float = 1.0  # of the unit
@@ -266,11 +268,14 @@ def _column(table: Table, field: Field, found: Any) -> _Column:  # noqa: ANN401
     try:
         if field.text:
             values, names, wrong = cells.texts(found, field.lower)
-        elif field.form:
+        elif field.form and field.form not in cells.CLOCK_DIGITS:
             values, wrong = cells.times(found, field.form)
         else:
             marks = table.marks(field.column) if cells.is_texts(found) else (".", "")
             values, wrong = cells.numbers(found, *marks)
+            if field.form:
+                values, bad = cells.times_of_day(values, field.form)
+                wrong |= bad
     except (TypeError, extra_module("pyarrow").ArrowException) as error:
         why = " ".join(str(error).split())[:200]
         expected = "texts" if field.text else "times" if field.form else "numbers"
