@@ -1,10 +1,11 @@
 """Runs the cases of `cases.txt` through a program and compares what it answers.
 
-    python onboard/conformance/check.py [--features-only] PROGRAM [ARGUMENT ...]
+    python onboard/conformance/check.py [--features-only | --filter] PROGRAM ...
 
 The program is started once for each case, with the path of the weights file as its
-last argument and the case on stdin. It writes the features and then the scores, as
-numbers between white space. Needs Python and nothing else; README.md has the format.
+last argument and the case on stdin. It writes the features, then the scores and, with
+`--filter`, the rulings of the safety filter, as numbers between white space. Needs
+Python and nothing else; README.md has the format.
 Exit status: 0 all equal, 1 a difference, 2 a program that fails or a file that does.
 """
 
@@ -17,6 +18,8 @@ from pathlib import Path
 CASES = Path(__file__).parent / "cases.txt"
 TOLERANCE = 1e-5  # of max(1, |x|)
 SECONDS = 60.0  # that a program may take for a case
+# what is compared: features alone, scores too, and the safety filter too
+FEATURES, SCORES, FILTER = "--features-only", "", "--filter"
 
 
 class Case:
@@ -27,8 +30,9 @@ class Case:
         (self.name,), (self.weights,), self.columns = (x[1:] for x in words[:3])
         answer = lines.index("answer")
         self.given = "\n".join([*lines[3:answer], "end", ""])
-        self.rows = [[float(x) for x in w[1:]] for w in words[answer + 1 : -2]]
-        self.scores = [float(x) for x in words[-2][1:]]
+        self.rows = [[float(x) for x in w[1:]] for w in words[answer + 1 : -3]]
+        self.scores = [float(x) for x in words[-3][1:]]
+        self.rulings = [float(x) for x in words[-2][1:]]
         (self.valid,) = (int(w[1]) for w in words if w[0] == "num_valid")
         self.times = len(self.rows) // len(self.scores)
 
@@ -40,12 +44,17 @@ class Case:
                 place = f"features: candidate {k}, time {t}, {column}"
                 yield place, value, t < self.valid
 
-    def expected(self, features_only: bool) -> list[tuple[str, float, bool]]:
-        """Every number of the answer."""
-        scores = [
-            (f"scores: candidate {k}", v, True) for k, v in enumerate(self.scores)
-        ]
-        return [*self.features(), *([] if features_only else scores)]
+    def expected(self, parts: str = SCORES) -> list[tuple[str, float, bool]]:
+        """Every number of the answer, of the parts that are asked for."""
+        found = list(self.features())
+        if parts != FEATURES:
+            places = (f"scores: candidate {k}" for k in range(len(self.scores)))
+            found += [(*x, True) for x in zip(places, self.scores, strict=True)]
+        if parts == FILTER:
+            for n, value in enumerate(self.rulings):
+                what = ("reason", "obstacle", "time")[n % 3]
+                found.append((f"rulings: candidate {n // 3}, {what}", value, True))
+        return found
 
 
 def read_cases(path: Path) -> list[Case]:
@@ -78,9 +87,9 @@ def answer(command: list[str], case: Case) -> list[float] | str:
         return str(error).splitlines()[0]
 
 
-def differences(case: Case, found: list[float], features_only: bool) -> list[str]:
+def differences(case: Case, found: list[float], parts: str) -> list[str]:
     """A line for every number that is not what it has to be."""
-    expected = case.expected(features_only)
+    expected = case.expected(parts)
     if len(found) < len(expected):
         return [f"{len(found)} numbers: expected {len(expected)}"]
     wrong = []
@@ -93,8 +102,8 @@ def differences(case: Case, found: list[float], features_only: bool) -> list[str
 
 def main(arguments: list[str]) -> int:
     """Check one program; the exit status."""
-    features_only = arguments[:1] == ["--features-only"]
-    command = arguments[features_only:]
+    given = arguments[:1] in ([FEATURES], [FILTER])
+    parts, command = arguments[0] if given else SCORES, arguments[given:]
     if not command:
         print("check.py: arguments: none: expected PROGRAM", file=sys.stderr)
         return 2
@@ -104,7 +113,7 @@ def main(arguments: list[str]) -> int:
         if isinstance(found, str):
             print(f"{case.name}: {found}", file=sys.stderr)
             return 2
-        wrong = differences(case, found, features_only)
+        wrong = differences(case, found, parts)
         failed += bool(wrong)
         for line in wrong[:5]:
             print(f"{case.name}: {line}", file=sys.stderr)

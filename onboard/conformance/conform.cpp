@@ -1,11 +1,14 @@
-// conform WEIGHTS < CASE: features and scores of one case of cases.txt, by these headers.
+// conform WEIGHTS < CASE: features, scores and rulings of one case, by these headers.
 //
-// Writes K * T * F features and K scores; README.md says how a case reads.
+// Writes K * T * F features, K scores, and reason, obstacle and time of K rulings; README.md
+// says how a case reads.
+#include <cmath>
 #include <cstdio>
 #include <vector>
 
 #include "../tests/flat.hpp"
 #include "rcirl/features.hpp"
+#include "rcirl/safety.hpp"
 
 int main(int count, char** arguments) {
   rcirl::Reward reward;
@@ -32,5 +35,13 @@ int main(int count, char** arguments) {
                scores.data());
   for (const float value : features) std::printf("%.9g\n", static_cast<double>(value));
   for (const float value : scores) std::printf("%.9g\n", static_cast<double>(value));
+  std::vector<rcirl::Ruling> rulings(candidates.count);
+  rcirl::admit(one.scene, candidates, {}, rulings.data());
+  for (const rcirl::Ruling& ruling : rulings) {
+    const bool named = ruling.obstacle != rcirl::Ruling::kNobody;
+    const double time = std::isfinite(ruling.time) ? static_cast<double>(ruling.time) : -1.0;
+    std::printf("%d %d %.9g\n", static_cast<int>(ruling.reason),
+                named ? static_cast<int>(ruling.obstacle) : -1, time);
+  }
   return 0;
 }

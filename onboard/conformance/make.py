@@ -1,4 +1,4 @@
-"""Writes `cases.txt` and its weights files: scenes, and what F and V are in JAX.
+"""Writes `cases.txt` and its weights files: scenes, and what JAX says of candidates.
 
     python -m onboard.conformance.make [FOLDER]
 
@@ -16,10 +16,11 @@ import numpy.typing as npt
 
 from rcirl_jax.export.own_planner.builder import plain_scene
 from rcirl_jax.features import feature_map
+from rcirl_jax.planner.safety import explain
 from rcirl_jax.runtime.atomic_files import write_whole
 from rcirl_jax.types import Kind, Scene
-from rcirl_jax.units import TIMES_S
-from tests.helpers import drawn_scenes
+from rcirl_jax.units import NUM_STATIONS, TIMES_S
+from tests.helpers import drawn_scenes, own_planner
 from tests.helpers.own_planner import drawn_reward, entries, jax_answers
 from tests.helpers.scenes import scene
 
@@ -65,6 +66,41 @@ def cases() -> Iterator[tuple[str, Scene]]:
     drawn = drawn_scenes.scenes(np.random.default_rng(0), DRAWN)
     for n in range(DRAWN):
         yield f"drawn_{n}", jax.tree.map(lambda x, n=n: x[n], drawn)
+    for name, made in unsafe().items():
+        yield name, jax.tree.map(np.asarray, made)
+
+
+def unsafe() -> dict[str, Scene]:
+    """Scenes whose candidates break the filter's rules, each one first."""
+    return {
+        "braking_leader": scene(boxes=[{"s": 25.0, "speed": 3.0}]),
+        "too_near": scene(v=20.0, boxes=[{"s": 12.0, "speed": 20.0}]),
+        "narrow_road": narrow(scene(v=20.0)),
+        "over_the_limit": scene(speed_limit=8.0),
+        "sharp_bend": scene(v=20.0, kappa=0.03),
+        "crossing": scene(boxes=[{"s": 40.0, "l": -1.2, "length": 0.6, "kind": 3}]),
+    }
+
+
+def narrow(made: Scene) -> Scene:
+    """A road whose right edge comes near from 30 m on."""
+    right = np.where(np.arange(NUM_STATIONS) < 15, -5.4, -0.5).astype(np.float32)
+    return made.replace(path=made.path.replace(road_right=right))
+
+
+def rulings(made: Scene, s: np.ndarray, l: np.ndarray | None) -> np.ndarray:
+    """Reason, obstacle and time [K, 3] in JAX; -1: no obstacle, no one time."""
+    kept = [n for n, kind in enumerate(made.obstacles.kind) if is_there(made, n, kind)]
+    found = explain(made, own_planner.candidates(made, s, l))
+    reason, obstacle, time = (np.asarray(x) for x in found)
+    # places among the obstacles of the plain scene, which has no empty slots
+    place = np.array([kept.index(n) if n >= 0 else -1 for n in obstacle.tolist()])
+    return np.stack([reason, place, np.where(np.isfinite(time), time, -1.0)], axis=1)
+
+
+def is_there(made: Scene, n: int, kind: int) -> bool:
+    """True if `plain_scene` keeps the slot."""
+    return kind != Kind.NONE and bool(np.any(made.obstacles.valid[n]))
 
 
 def line(label: str, numbers: npt.ArrayLike) -> str:
@@ -95,7 +131,8 @@ def main(folder: Path) -> None:
         text += [line(*entry) for entry in entries(plain_scene(made), *ways)]
         text.append("answer")
         text += [line("features", row) for way in features for row in way]
-        text += [line("scores", values), "end", ""]
+        text += [line("scores", values), line("rulings", rulings(made, *ways).ravel())]
+        text += ["end", ""]
     write_whole(folder / "cases.txt", "\n".join(text).encode())
     print(f"written: {folder / 'cases.txt'}")
 

@@ -50,12 +50,18 @@ rcirl::Scene scene(Floats* bits, std::size_t obstacles) {
   bits->fill(&made.path.kappa);
   bits->fill(&made.path.l);
   bits->fill(&made.path.speed_limit);
+  bits->fill(&made.path.road_left);
+  bits->fill(&made.path.road_right);
   made.num_valid = bits->folded ? 1 + bits->byte() % rcirl::kTimes : bits->byte();
   if (bits->folded) {
     made.ego.length = 0.1f + std::abs(made.ego.length);
     made.ego.width = 0.1f + std::abs(made.ego.width);
     for (float& kappa : made.path.kappa) kappa *= 1e-3f;
     for (float& limit : made.path.speed_limit) limit = std::abs(limit);
+    for (std::size_t p = 0; p < rcirl::kStations; ++p) {
+      float &left = made.path.road_left[p], &right = made.path.road_right[p];
+      if (left < right) std::swap(left, right);
+    }
   }
   for (std::size_t n = 0; n < obstacles; ++n) made.obstacles.push_back(obstacle(bits));
   return made;

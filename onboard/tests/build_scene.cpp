@@ -1,6 +1,6 @@
 // build_scene < SURROUNDINGS: what `scene_from` makes of numbers, for the Python tests.
 //
-// The numbers: the ego's 8; the line's width and points (x, y, limit) after their count;
+// The numbers: the ego's 8; the line's width, road edges and points (x, y, limit) after their count;
 // the others (kind and 7 more, then poses after their count); signals (x, y, state); the
 // path's points; the destination's. Writes the scene as float32 in the order of flat.hpp,
 // or its refusal to stderr.
@@ -32,6 +32,8 @@ rcirl::Surroundings surroundings() {
     *value = number();
   }
   now.line.lane_width = number();
+  now.line.road_left = number();
+  now.line.road_right = number();
   for (std::size_t left = count(); left > 0; --left) {
     const double x = number(), y = number();
     now.line.points.push_back({x, y});
@@ -82,6 +84,8 @@ int main() {
   write(scene.path.kappa);
   write(scene.path.l);
   write(scene.path.speed_limit);
+  write(scene.path.road_left);
+  write(scene.path.road_right);
   const float counts[] = {static_cast<float>(scene.num_valid),
                           static_cast<float>(scene.obstacles.size())};
   write(counts, 2);

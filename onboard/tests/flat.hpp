@@ -61,6 +61,8 @@ bool take_case(Source& source, Case* found) {
   scene.ego = {e[0], e[1], e[2], e[3], e[4], e[5], e[6], e[7]};
   if (!take(source, "kappa", &scene.path.kappa) || !take(source, "path_l", &scene.path.l) ||
       !take(source, "speed_limit", &scene.path.speed_limit) ||
+      !take(source, "road_left", &scene.path.road_left) ||
+      !take(source, "road_right", &scene.path.road_right) ||
       !take_count(source, "num_valid", &scene.num_valid) ||
       !take_count(source, "obstacles", &count)) {
     return false;

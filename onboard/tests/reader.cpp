@@ -7,8 +7,12 @@
 //                                            feature's place, its share"
 //   reader features WEIGHTS CASES         -> for each case of CASES (tests/flat.hpp, float32)
 //                                            float32 features [K, T, F] and scores [K]
+//   reader admit CASES                    -> for each case float32 rulings [K, 3]: reason,
+//                                            obstacle and time, -1 if none
+//   reader describe WEIGHTS               -> what the reward says of itself
 //   reader check BATCH                    -> for each file of BATCH, its bytes after
 //                                            their number as uint64, "ok" or its refusal
+#include <cmath>
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
@@ -20,6 +24,7 @@
 #include "rcirl/features.hpp"
 #include "rcirl/guard.hpp"
 #include "rcirl/reward.hpp"
+#include "rcirl/safety.hpp"
 
 namespace {
 
@@ -97,6 +102,41 @@ bool write(const std::vector<float>& values) {
   return std::fwrite(values.data(), 4, values.size(), stdout) == values.size();
 }
 
+std::vector<float> floats(const char* path) {
+  const std::vector<char> bytes = contents(path);
+  std::vector<float> numbers(bytes.size() / 4);
+  if (!numbers.empty()) std::memcpy(numbers.data(), bytes.data(), 4 * numbers.size());
+  return numbers;
+}
+
+int admit(const char* cases) {
+  const std::vector<float> numbers = floats(cases);
+  Numbers source = {numbers.data(), numbers.data() + numbers.size()};
+  Case one;
+  while (source.at != source.end) {
+    if (!take_case(source, &one)) return 2;
+    const rcirl::Candidates candidates = one.candidates();
+    std::vector<rcirl::Ruling> rulings(candidates.count);
+    rcirl::admit(one.scene, candidates, {}, rulings.data());
+    std::vector<float> found;
+    for (const rcirl::Ruling& ruling : rulings) {
+      const bool named = ruling.obstacle != rcirl::Ruling::kNobody;
+      found.push_back(static_cast<float>(ruling.reason));
+      found.push_back(named ? static_cast<float>(ruling.obstacle) : -1.0f);
+      found.push_back(std::isfinite(ruling.time) ? ruling.time : -1.0f);
+    }
+    if (!write(found)) return 1;
+  }
+  return 0;
+}
+
+int describe(const char* weights) {
+  rcirl::Reward reward;
+  const rcirl::Status status = rcirl::load(weights, &reward);
+  std::printf("%s\n", status.ok() ? describe(reward).c_str() : status.message().c_str());
+  return status.ok() ? 0 : 2;
+}
+
 int features(const char* weights, const char* cases) {
   rcirl::Reward reward;
   rcirl::FeatureMap columns;
@@ -106,9 +146,7 @@ int features(const char* weights, const char* cases) {
     std::fprintf(stderr, "%s\n", status.message().c_str());
     return 2;
   }
-  const std::vector<char> bytes = contents(cases);
-  std::vector<float> numbers(bytes.size() / 4);
-  if (!numbers.empty()) std::memcpy(numbers.data(), bytes.data(), 4 * numbers.size());
+  const std::vector<float> numbers = floats(cases);
   Numbers source = {numbers.data(), numbers.data() + numbers.size()};
   rcirl::Workspace workspace = reward.workspace();
   Case one;
@@ -151,6 +189,8 @@ int check(const char* batch) {
 int main(int count, char** arguments) {
   const std::string mode = count > 1 ? arguments[1] : "";
   if (mode == "check" && count == 3) return check(arguments[2]);
+  if (mode == "admit" && count == 3) return admit(arguments[2]);
+  if (mode == "describe" && count == 3) return describe(arguments[2]);
   if (mode == "features" && count == 4) return features(arguments[2], arguments[3]);
   if ((mode == "score" || mode == "guard") && (count == 4 || count == 5)) {
     Given given;
@@ -164,6 +204,6 @@ int main(int count, char** arguments) {
   }
   std::fprintf(stderr,
                "reader: arguments: expected score or guard WEIGHTS FEATURES [MASK] | "
-               "total WEIGHTS FEATURES OWN [MASK] | features WEIGHTS CASES | check BATCH\n");
+               "total WEIGHTS FEATURES OWN [MASK] | features WEIGHTS CASES | admit CASES | describe WEIGHTS | check BATCH\n");
   return 2;
 }

@@ -16,8 +16,12 @@ depends on how familiar the scene is:
     z_i     = clip((f_0i - location_i) / scale_i, -5, 5)      f_0 raw, location of it
 
     reward = load_weights("weights.msgpack")
+    print(reward.describe())             # what it was trained for, and what not
     reward.check_features(names, units)  # the planner's columns, in its order
-    best = int(np.argmax(reward.value(features)))  # features [K, T, F]
+    values = reward.value(features)      # [K] of features [K, T, F]
+
+A value says nothing of safety: choose among candidates that a safety filter admits, as
+`choose` of `own_planner/choose.py` does.
 """
 
 import dataclasses
@@ -173,10 +177,35 @@ class Reward:
         )
 
     @property
+    def mode(self) -> str:
+        """Return what candidates may differ in.
+
+        Returns:
+          "speed": in s(t) along one path; l was not trained. "path_speed": in l too.
+        """
+        mode = self.provenance.get("mode", "speed")
+        return "path_speed" if mode == "path_speed" else "speed"
+
+    @property
     def unsupported(self) -> tuple[str, ...]:
         """Return features without effect: the training never saw them vary."""
         empty = zip(self.names, self.lower >= self.upper, strict=True)
         return tuple(name for name, none in empty if none)
+
+    def describe(self) -> str:
+        """Return lines on what the values mean and what they do not, for a log."""
+        prior, last = self.prior_cost, float(self.times[-1])
+        lateral = "l was not trained" if self.mode == "speed" else "l was trained"
+        gain = "" if prior is None else f"{_show(prior.low)} to {_show(prior.high)}"
+        lines = (
+            f"mode: {self.mode}: {lateral}",
+            f"features without effect: {', '.join(self.unsupported) or 'none'}",
+            "prior cost: "
+            + ("none" if prior is None else f"{prior.incumbent}, gain {gain}"),
+            f"times: {len(self.times)} from 0 to {_show(last)} s",
+            "safety: none: filter the candidates before you choose",
+        )
+        return "\n".join(lines)
 
     def check_features(self, names: Sequence[str], units: Sequence[str]) -> None:
         """Refuse columns that are not the file's, in the file's order and units."""

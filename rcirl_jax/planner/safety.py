@@ -5,29 +5,45 @@ It is the same for learned, hand-set and random scores. For each candidate:
 1. swept boxes: between neighbouring times the ego's box and an obstacle's box
    slide linearly past each other in the Frenet frame; they must not touch;
 2. stop lines and red lights that demand a stop are walls for the front bumper;
-3. road edges bound the box's sides;
-4. hard limits: the speed limit handed to the planner and lateral acceleration;
-5. a distance from which braking still avoids the leader (RSS, Shalev-Shwartz
+3. hard limits: the speed limit handed to the planner, the road's edges for the
+   box's sides, and lateral acceleration;
+4. a distance from which braking still avoids the leader (RSS, Shalev-Shwartz
    et al. 2017), or at least a growing margin where another car took it away.
 
-Emergency stops are always among the candidates. If no candidate is admissible, the one
-with the latest contact is driven (`choose`).
+`check` tells which candidates keep all rules, `explain` which rule each breaks first.
+Numbers of an obstacle at times when it is not there are never read.
+
+The sampler's emergency stops are always among its candidates. If no candidate is
+admissible, the one with the latest contact is driven (`choose`).
+
+The file runs on numpy and on JAX, as `features/columns.py` does: a planner may copy it,
+with the files that `export/own_planner/features.py` names.
 """
 
 import dataclasses
+import enum
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
-import flax.struct
-import jax
-import jax.numpy as jnp
+try:
+    from rcirl_jax.errors import InputError
+    from rcirl_jax.features.columns import namespace, path_view
+    from rcirl_jax.units import DT_S, TIMES_S, Kind
+except ImportError:  # the files were copied
+    from columns import namespace, path_view  # pyright: ignore[reportMissingImports]
+    from units import DT_S, TIMES_S, Kind  # pyright: ignore[reportMissingImports]
 
-from rcirl_jax.errors import InputError
-from rcirl_jax.features.columns import path_view
-from rcirl_jax.geometry.boxes import frenet_extent
-from rcirl_jax.types import Candidates, Kind, Scene, Trajectory
-from rcirl_jax.units import DT_S, TIMES_S
+    InputError = ValueError
+
+Array = Any  # of numpy, or of JAX
+# of rcirl_jax.types, or plain ones with the same fields
+Scene = Any
+Candidates = Any
+Trajectory = Any
 
 MOVING_MPS = 1.0  # m/s, above which a body's prediction is uncertain
 CROSSING_MPS = 1.0  # m/s, sideways speed above which a body is no lead vehicle
+FREE_M = 1e3  # m, the margin to a leader where there is none
 
 
 TRACKS = ("full", "collision")
@@ -37,7 +53,7 @@ TRACKS = ("full", "collision")
 class SafetyConfig:
     """Margins and limits of the filter; hashable."""
 
-    # "full": all five rules; "collision": only bodies and lines (1 and 2), so that
+    # "full": all rules; "collision": only bodies and lines (1 and 2), so that
     # everything else is the reward's to decide
     track: str = "full"
     # m added along the road on each side of an obstacle
@@ -74,28 +90,143 @@ class SafetyConfig:
             raise InputError(f"track: {self.track}: expected one of {TRACKS}")
 
 
-class Verdict(flax.struct.PyTreeNode, kw_only=True):
+class Verdict(NamedTuple):
     """The findings of the filter; all [K]."""
 
-    admissible: jax.Array  # bool
-    contact_s: jax.Array  # s, first contact with a body; inf if none
-    contact_v: jax.Array  # m/s, speed at that time
-    rss_margin: jax.Array  # m, smallest distance beyond the RSS distance
+    admissible: Array  # bool
+    contact_s: Array  # s, first contact with a body; inf if none
+    contact_v: Array  # m/s, speed at that time
+    rss_margin: Array  # m, smallest distance beyond the RSS distance
+
+
+class Reason(enum.IntEnum):
+    """The rules of the filter, in the order in which `explain` names them."""
+
+    NONE = 0  # admissible
+    NOT_FEASIBLE = 1  # so the planner said
+    BODY = 2  # touches a body
+    LINE = 3  # passes a line that demands a stop
+    SPEED = 4  # over the speed limit
+    ROAD = 5  # a side of the box leaves the road
+    BEND = 6  # lateral acceleration
+    DISTANCE = 7  # too near behind a leader
+
+
+class Explanation(NamedTuple):
+    """Which rule each candidate breaks first; all [K]."""
+
+    reason: Array  # int32, `Reason`
+    obstacle: Array  # int32, the obstacle's place in the scene; -1: of none
+    time_s: Array  # s, when; inf: at no one time
+
+
+class Motion(NamedTuple):
+    """What the filter reads of candidates; all [T, K], so that loops are long."""
+
+    s: Array  # m
+    v: Array  # m/s
+    l: Array  # m
+    dl: Array  # 1
+    ddl: Array  # 1/m
+
+
+def motion_of(trajectory: Trajectory) -> Motion:
+    """Return the leaves [K, T] of trajectories as the filter reads them, [T, K]."""
+    return Motion(*(getattr(trajectory, name).T for name in Motion._fields))
 
 
 def check(
     scene: Scene, candidates: Candidates, config: SafetyConfig = SafetyConfig()
 ) -> Verdict:
-    """Judge all candidates [K] of one scene."""
-    trajectory = candidates.trajectory
-    body = first_contact(scene, jax.tree.map(jnp.transpose, trajectory), config)
-    judge = jax.vmap(lambda x, ok, hit: _check_one(scene, x, ok, hit, config))
-    return judge(trajectory, candidates.feasible, body)
+    """Judge all candidates of one scene.
+
+    Args:
+      scene: one planning frame; of N obstacles at least 1, which may be empty.
+      candidates: K of them.
+      config: margins and limits.
+
+    Returns:
+      A verdict with leaves [K].
+    """
+    x = motion_of(candidates.trajectory)
+    xp = namespace(x.s, scene.path.l)
+    body = first_contact(scene, x, config)
+    line = xp.where(_crossings(scene, x, config), TIMES_S[:, None], xp.inf)
+    margin, keeps = _rss(scene, x, config)
+    moment = xp.clip(xp.round(body / DT_S), 0, x.v.shape[0] - 1).astype("int32")
+    speed = xp.take_along_axis(x.v, moment[None], axis=0)[0]
+    clear = xp.isinf(body) & xp.isinf(xp.min(line, axis=(0, 1)))
+    admissible = candidates.feasible & clear
+    if config.track != "collision":
+        slow, on_road, gentle = _inside_limits(scene, x, config)
+        inside = xp.all(slow & on_road & gentle, axis=0)
+        admissible = admissible & inside & xp.all(keeps, axis=0)
+    return Verdict(
+        admissible=admissible,
+        contact_s=body,
+        contact_v=xp.where(xp.isfinite(body), speed, 0.0),
+        rss_margin=xp.min(margin, axis=0),
+    )
+
+
+def explain(
+    scene: Scene, candidates: Candidates, config: SafetyConfig = SafetyConfig()
+) -> Explanation:
+    """Return the first rule that each candidate breaks.
+
+    Rules come in the order of `Reason`, within a rule the earliest time, at one time
+    the first obstacle. `Reason.NONE` is given where `check` says admissible.
+
+    Args:
+      scene: as in `check`.
+      candidates: as in `check`.
+      config: as in `check`.
+
+    Returns:
+      An explanation with leaves [K].
+    """
+    x = motion_of(candidates.trajectory)
+    xp = namespace(x.s, scene.path.l)
+    touched = xp.stack(list(_touches(scene, x, config)))  # [N, T - 1, K]
+    passed = _crossings(scene, x, config)  # [N, T, K]
+    rules = [
+        _first_of(xp.where(touched, TIMES_S[:-1, None], xp.inf)),
+        _first_of(xp.where(passed, TIMES_S[:, None], xp.inf)),
+    ]
+    if config.track != "collision":
+        for fine in _inside_limits(scene, x, config):
+            at = xp.where(fine, xp.inf, TIMES_S[1:, None])
+            rules.append((xp.any(~fine, axis=0), None, xp.min(at, axis=0)))
+        margin, keeps = _rss(scene, x, config)
+        nearest = xp.argmin(xp.where(keeps, xp.inf, margin), axis=0)
+        rules.append((xp.any(~keeps, axis=0), nearest, None))
+    count = x.s.shape[1]
+    reason = xp.zeros(count, "int32")
+    obstacle, time = xp.full(count, -1, "int32"), xp.full(count, xp.inf, "float32")
+    # the last rule first, so that the first one stays
+    for number, (broken, which, at) in reversed([*enumerate(rules, Reason.BODY)]):
+        reason = xp.where(broken, number, reason)
+        obstacle = xp.where(broken, -1 if which is None else which, obstacle)
+        time = xp.where(broken, xp.inf if at is None else at, time)
+    wrong = ~candidates.feasible
+    return Explanation(
+        reason=xp.where(wrong, Reason.NOT_FEASIBLE, reason).astype("int32"),
+        obstacle=xp.where(wrong, -1, obstacle).astype("int32"),
+        time_s=xp.where(wrong, xp.inf, time).astype("float32"),
+    )
+
+
+def _first_of(times: Array) -> tuple[Array, Array, Array]:
+    """From times [N, T, K], inf where a rule holds: broken, by which, and when, [K]."""
+    xp = namespace(times)
+    first = xp.min(times, axis=1)
+    at = xp.min(first, axis=0)
+    return xp.isfinite(at), xp.argmin(first, axis=0), at
 
 
 def choose(
-    verdict: Verdict, candidates: Candidates, scores: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+    verdict: Verdict, candidates: Candidates, scores: Array
+) -> tuple[Array, Array]:
     """Index of the best admissible candidate, and whether there was none.
 
     A candidate whose score is not a number is not admissible.
@@ -104,45 +235,31 @@ def choose(
     the larger margin to the leader, then the lower speed at the contact, then the
     shorter distance, which is the harder braking.
     """
-    admissible = verdict.admissible & ~jnp.isnan(scores)
-    best = jnp.argmax(jnp.where(admissible, scores, -jnp.inf))
-    nothing = ~jnp.any(admissible)
-    late = jnp.minimum(verdict.contact_s, TIMES_S[-1] + 1.0)
+    xp = namespace(verdict.contact_s, scores)
+    admissible = verdict.admissible & ~xp.isnan(scores)
+    best = xp.argmax(xp.where(admissible, scores, -xp.inf))
+    nothing = ~xp.any(admissible)
+    late = xp.minimum(verdict.contact_s, TIMES_S[-1] + 1.0)
     # who drives through the leader has none ahead: its margin means nothing
-    free = jnp.isinf(verdict.contact_s)
-    margin = jnp.where(free, jnp.clip(verdict.rss_margin, -400.0, 0.0), -400.0)
+    free = xp.isinf(verdict.contact_s)
+    margin = xp.where(free, xp.clip(verdict.rss_margin, -400.0, 0.0), -400.0)
     way = candidates.trajectory.s[:, -1]
     urgency = 1e3 * late + margin - 0.1 * verdict.contact_v - 0.01 * way
-    fallback = jnp.argmax(jnp.where(candidates.feasible, urgency, -jnp.inf))
-    return jnp.where(nothing, fallback, best), nothing
+    fallback = xp.argmax(xp.where(candidates.feasible, urgency, -xp.inf))
+    return xp.where(nothing, fallback, best), nothing
 
 
-def _check_one(
-    scene: Scene,
-    x: Trajectory,
-    feasible: jax.Array,
-    body: jax.Array,
-    config: SafetyConfig,
-) -> Verdict:
-    line = _first_crossing(scene, x, config)
-    margin, gains = _rss(scene, x, config)
-    inside = _inside_limits(scene, x, config)
-    moment = jnp.clip(jnp.round(body / DT_S), 0, x.v.shape[0] - 1).astype(jnp.int32)
-    speed = jnp.where(jnp.isfinite(body), x.v[moment], 0.0)
-    clear = jnp.isinf(body) & jnp.isinf(line)
-    keeps = (margin >= 0.0) | gains
-    if config.track == "collision":
-        inside, keeps = jnp.ones((), bool), jnp.ones((), bool)
-    return Verdict(
-        admissible=feasible & clear & inside & keeps,
-        contact_s=body,
-        contact_v=speed,
-        rss_margin=margin,
-    )
+def first_contact(scene: Scene, x: Motion, config: SafetyConfig) -> Array:
+    """Start [s] of the first interval with a contact, [K]; inf without one."""
+    xp = namespace(x.s, scene.obstacles.s_lower)
+    touched = xp.zeros(x.s[:-1].shape, bool)
+    for touched_one in _touches(scene, x, config):
+        touched = touched | touched_one
+    return xp.min(xp.where(touched, TIMES_S[:-1, None], xp.inf), axis=0)
 
 
-def first_contact(scene: Scene, x: Trajectory, config: SafetyConfig) -> jax.Array:
-    """Start [s] of the first interval with a contact, [K]; inf without one.
+def _touches(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
+    """For each obstacle, the intervals [T - 1, K] in which it is touched.
 
     Between two times the centres' distance runs on a straight segment with
     middle m and half extent h; the boxes, added up to half sides e, touch it
@@ -153,97 +270,112 @@ def first_contact(scene: Scene, x: Trajectory, config: SafetyConfig) -> jax.Arra
 
     Boxes that are tilted enter with their extents along the axes, which
     contain them. A body that overlaps the ego's corridor from behind does not count.
-    Every leaf of `x` is [T, K] here: long loops.
     """
     obstacles, ego = scene.obstacles, scene.ego
-    extent = jax.vmap(jax.vmap(frenet_extent, (None, None, 0)), (None, None, 0))
-    half_s, half_l = extent(ego.length, ego.width, jnp.arctan(x.dl))
-    wide_s = jnp.maximum(half_s[:-1], half_s[1:]) + config.margin_along
-    wide_l = jnp.maximum(half_l[:-1], half_l[1:]) + config.margin_across
-    starts = jnp.asarray(TIMES_S)[:-1, None]
-    touched = jnp.zeros(wide_s.shape, bool)
+    xp = namespace(x.s, obstacles.s_lower)
+    # of a box tilted by arctan(dl)
+    cosine = 1.0 / xp.sqrt(1.0 + x.dl**2)
+    sine = xp.abs(x.dl) * cosine
+    half_s = 0.5 * (ego.length * cosine + ego.width * sine)
+    half_l = 0.5 * (ego.length * sine + ego.width * cosine)
+    wide_s = xp.maximum(half_s[:-1], half_s[1:]) + config.margin_along
+    wide_l = xp.maximum(half_l[:-1], half_l[1:]) + config.margin_across
+    body = (obstacles.kind >= Kind.VEHICLE) & (obstacles.kind <= Kind.STATIC)
+    known = (obstacles.valid[:, 1:] & obstacles.valid[:, :-1])[:, :, None]
+    known = known & body[:, None, None]
+    # what a body does when it is first there
+    first = xp.argmax(obstacles.valid, axis=1)
+    s_lower, s_upper, l_lower, l_upper, speed = (
+        xp.take_along_axis(getattr(obstacles, name), first[:, None], axis=1)
+        for name in ("s_lower", "s_upper", "l_lower", "l_upper", "speed")
+    )
+    aside = xp.abs(0.5 * (l_upper + l_lower) - x.l[first])
+    in_way = aside < 0.5 * (l_upper - l_lower) + half_l[first]
+    behind = (0.5 * (s_upper + s_lower) - x.s[first] < 0.0) & in_way  # [N, K]
+    moves = (xp.abs(speed[:, 0]) > MOVING_MPS) & (obstacles.kind != Kind.STATIC)
+    starts = TIMES_S[:-1, None]
     for n in range(obstacles.kind.shape[0]):
-        o = jax.tree.map(lambda a, n=n: a[n], obstacles)
-        size_s = 0.5 * (o.s_upper - o.s_lower)[:, None]
-        size_l = 0.5 * (o.l_upper - o.l_lower)[:, None]
-        ds = 0.5 * (o.s_upper + o.s_lower)[:, None] - x.s
-        dl = 0.5 * (o.l_upper + o.l_lower)[:, None] - x.l
+        low_s, high_s = obstacles.s_lower[n][:, None], obstacles.s_upper[n][:, None]
+        low_l, high_l = obstacles.l_lower[n][:, None], obstacles.l_upper[n][:, None]
+        size_s, size_l = 0.5 * (high_s - low_s), 0.5 * (high_l - low_l)
+        ds, dl = 0.5 * (high_s + low_s) - x.s, 0.5 * (high_l + low_l) - x.l
         m_s, h_s = 0.5 * (ds[1:] + ds[:-1]), 0.5 * (ds[1:] - ds[:-1])
         m_l, h_l = 0.5 * (dl[1:] + dl[:-1]), 0.5 * (dl[1:] - dl[:-1])
-        moving = (jnp.abs(o.speed[0]) > MOVING_MPS) & (o.kind != Kind.STATIC)
-        grown = jnp.where(moving, config.margin_growth * starts, 0.0)
-        e_s = wide_s + grown + jnp.maximum(size_s[1:], size_s[:-1])
-        e_l = wide_l + jnp.maximum(size_l[1:], size_l[:-1])
-        h_s, h_l = jnp.abs(h_s), jnp.abs(h_l)
-        cross = jnp.abs(m_s * (dl[1:] - dl[:-1]) - m_l * (ds[1:] - ds[:-1]))
-        near = (jnp.abs(m_s) <= e_s + h_s) & (jnp.abs(m_l) <= e_l + h_l)
+        grown = xp.where(moves[n], config.margin_growth * starts, 0.0)
+        e_s = wide_s + grown + xp.maximum(size_s[1:], size_s[:-1])
+        e_l = wide_l + xp.maximum(size_l[1:], size_l[:-1])
+        h_s, h_l = xp.abs(h_s), xp.abs(h_l)
+        cross = xp.abs(m_s * (dl[1:] - dl[:-1]) - m_l * (ds[1:] - ds[:-1]))
+        near = (xp.abs(m_s) <= e_s + h_s) & (xp.abs(m_l) <= e_l + h_l)
         near = near & (0.5 * cross <= e_s * h_l + e_l * h_s)
-        behind = (ds[:1] < 0.0) & (jnp.abs(dl[:1]) < size_l[:1] + half_l[:1])
-        is_body = (o.kind >= Kind.VEHICLE) & (o.kind <= Kind.STATIC)
-        known = is_body & (o.valid[1:] & o.valid[:-1])[:, None]
-        touched = touched | (near & known & ~behind)
-    return jnp.min(jnp.where(touched, starts, jnp.inf), axis=0)
+        yield near & known[n] & ~behind[n]
 
 
-def _first_crossing(scene: Scene, x: Trajectory, config: SafetyConfig) -> jax.Array:
-    """Time [s] at which the front bumper passes a demanding line; inf if never."""
+def _crossings(scene: Scene, x: Motion, config: SafetyConfig) -> Array:
+    """Where [N, T, K] the front bumper is past a line that demands a stop.
+
+    A line that lies behind the front bumper now is none.
+    """
     obstacles = scene.obstacles
+    xp = namespace(x.s, obstacles.s_lower)
     front = x.s + 0.5 * scene.ego.length
-    before = front[0] <= obstacles.s_lower[:, :1]
-    is_line = (obstacles.kind == Kind.STOP)[:, None] & obstacles.valid & before
+    wall = obstacles.s_lower[:, :, None]
+    left = wall - front[0]
+    is_line = (obstacles.kind == Kind.STOP)[:, None, None]
+    is_line = is_line & obstacles.valid[:, :, None] & (left >= 0.0)
     # nearer than twice the margin, half of the way that is left
-    left = obstacles.s_lower[:, :1] - front[0]
-    slack = jnp.minimum(config.line_margin, 0.5 * left)
-    passed = is_line & (front > obstacles.s_lower - slack)
-    return jnp.min(jnp.where(passed, jnp.asarray(TIMES_S), jnp.inf))
+    slack = xp.minimum(config.line_margin, 0.5 * left)
+    return is_line & (front > wall - slack)
 
 
-def _rss(
-    scene: Scene, x: Trajectory, config: SafetyConfig
-) -> tuple[jax.Array, jax.Array]:
-    """Margin [m] to the RSS distance soon, and whether it grows.
+def _rss(scene: Scene, x: Motion, config: SafetyConfig) -> tuple[Array, Array]:
+    """Margin [N, K] m to the RSS distance soon, and whether it is kept or grows.
 
     d = v rho + v^2 / (2 b_ego) - v_lead^2 / (2 b_lead) + standstill
     """
     obstacles, ego = scene.obstacles, scene.ego
+    xp = namespace(x.s, obstacles.s_lower)
+    body = (obstacles.kind >= Kind.VEHICLE) & (obstacles.kind <= Kind.STATIC)
+    sideways = xp.abs(obstacles.l_lower[:, 1] - obstacles.l_lower[:, 0]) / DT_S
+    seen = obstacles.valid[:, 1] & obstacles.valid[:, 0]
+    along = (sideways < CROSSING_MPS) | ~seen
 
-    def margin(i: int) -> jax.Array:
-        gap = obstacles.s_lower[:, i] - x.s[i] - 0.5 * ego.length
-        aside = jnp.maximum(
-            obstacles.l_lower[:, i] - x.l[i], x.l[i] - obstacles.l_upper[:, i]
+    def margin(i: int) -> Array:
+        s_lower, s_upper, l_lower, l_upper, speed = (
+            getattr(obstacles, name)[:, i, None]
+            for name in ("s_lower", "s_upper", "l_lower", "l_upper", "speed")
         )
-        lead = jnp.maximum(obstacles.speed[:, i], 0.0)
+        gap = s_lower - x.s[i] - 0.5 * ego.length
+        aside = xp.maximum(l_lower - x.l[i], x.l[i] - l_upper)
+        lead = xp.maximum(speed, 0.0)
         needed = (
             x.v[i] * config.reaction
             + x.v[i] ** 2 / (2.0 * config.ego_braking)
             - lead**2 / (2.0 * config.leader_braking)
         )
-        needed = jnp.maximum(needed, 0.0) + config.standstill
+        needed = xp.maximum(needed, 0.0) + config.standstill
         in_way = aside < 0.5 * ego.width + config.margin_across
-        body = (obstacles.kind >= Kind.VEHICLE) & (obstacles.kind <= Kind.STATIC)
-        ahead = obstacles.s_upper[:, i] > x.s[i]
-        sideways = jnp.abs(obstacles.l_lower[:, 1] - obstacles.l_lower[:, 0]) / DT_S
-        along = sideways < CROSSING_MPS
-        leads = body & in_way & ahead & along & obstacles.valid[:, i]
-        return jnp.where(leads, gap - needed, 1e3)
+        ahead = s_upper > x.s[i]
+        leads = in_way & ahead & (body & along & obstacles.valid[:, i])[:, None]
+        return xp.where(leads, gap - needed, FREE_M)
 
     now, soon = margin(0), margin(config.rss_index)
-    worst = jnp.min(soon)
-    grows = (soon >= 0.0) | (soon >= now + config.rss_recovery)
-    return worst, jnp.all(grows)
+    return soon, (soon >= 0.0) | (soon >= now + config.rss_recovery)
 
 
-def _inside_limits(scene: Scene, x: Trajectory, config: SafetyConfig) -> jax.Array:
-    """Speed limit, lateral acceleration and road edges at all later times."""
+def _inside_limits(
+    scene: Scene, x: Motion, config: SafetyConfig
+) -> tuple[Array, Array, Array]:
+    """Whether speed, road edges and lateral acceleration hold later on, [T - 1, K]."""
     view = path_view(scene, x.s)
-    times = jnp.asarray(TIMES_S)
+    xp = namespace(x.s, view.l)
     # the lower limit of an interval's two ends holds for all of it
-    before = jnp.concatenate([view.speed_limit[:1], view.speed_limit[:-1]])
-    limit = jnp.minimum(view.speed_limit, before) + config.speed_slack
-    allowed = jnp.maximum(limit, scene.ego.v - config.speed_recovery * times)
-    slow = x.v <= allowed
+    before = xp.concatenate([view.speed_limit[:1], view.speed_limit[:-1]])
+    limit = xp.minimum(view.speed_limit, before) + config.speed_slack
+    recovered = scene.ego.v - config.speed_recovery * TIMES_S[:, None]
+    slow = x.v <= xp.maximum(limit, recovered)
     half = 0.5 * scene.ego.width
-    outside = jnp.maximum(x.l + half - view.road_left, view.road_right - (x.l - half))
+    outside = xp.maximum(x.l + half - view.road_left, view.road_right - (x.l - half))
     on_road = (outside <= 0.0) | (outside <= outside[0] + 0.01)
-    gentle = jnp.abs(x.v**2 * view.curvature(x)) <= config.max_lateral_acceleration
-    return jnp.all((slow & on_road & gentle)[1:])
+    gentle = xp.abs(x.v**2 * view.curvature(x)) <= config.max_lateral_acceleration
+    return slow[1:], on_road[1:], gentle[1:]

@@ -35,6 +35,9 @@ def drawn_reward(path, columns, hidden=(15,), scene_gating=False, seed=3):
     lower, upper = (
         np.array([getattr(s, n) for s in specs]) for n in ("lower", "upper")
     )
+    gates = drawn.scene_gating
+    if gates is not None:  # as training leaves it: what candidates share at t = 0
+        gates = gates / size * np.array(columns.context)[:, None]
     made = dataclasses.replace(
         drawn,
         preset=columns.preset,
@@ -48,7 +51,7 @@ def drawn_reward(path, columns, hidden=(15,), scene_gating=False, seed=3):
         kernels=tuple(kernel / np.sqrt(len(kernel)) for kernel in drawn.kernels),
         biases=(*drawn.biases[:-1], np.zeros(1)),  # as training leaves it
         gamma=drawn.gamma / np.sqrt(TIMES_S.size),
-        scene_gating=None if drawn.scene_gating is None else drawn.scene_gating / size,
+        scene_gating=gates,
     )
     x = rng.uniform(lower, upper, (3, TIMES_S.size, size)).astype(np.float32)
     valid = np.ones(x.shape[:2], bool)
@@ -56,8 +59,8 @@ def drawn_reward(path, columns, hidden=(15,), scene_gating=False, seed=3):
     return save(path, made, x, valid, np.array(values))
 
 
-def _candidates(scene, s, l):
-    """Candidates of one scene from [K, T] positions; l None: on the path."""
+def candidates(scene, s, l):
+    """The Candidates of one scene from [K, T] positions; l None: on the path."""
     if l is None:
         motion = jax.vmap(trajectory_on_path, (None, 0))(scene, s)
     else:
@@ -74,7 +77,7 @@ def _answers(columns, activation, on_path):
     score = learned_score(columns, activation)
 
     def of_one(params, scene, s, l):
-        both = _candidates(scene, s, None if on_path else l)
+        both = candidates(scene, s, None if on_path else l)
         return columns.of_candidates(scene, both), score(params, scene, both)
 
     return jax.jit(jax.vmap(of_one, (None, 0, 0, 0)))
@@ -83,7 +86,7 @@ def _answers(columns, activation, on_path):
 def compiled_score(columns, reward):
     """A compiled function (scene, s, l [K, T]) -> values [K] of one planning frame."""
     score, params = learned_score(columns, reward.activation), reward_params(reward)
-    return jax.jit(lambda scene, s, l: score(params, scene, _candidates(scene, s, l)))
+    return jax.jit(lambda scene, s, l: score(params, scene, candidates(scene, s, l)))
 
 
 def jax_answers(columns, reward, scenes, s, l=None):
@@ -105,8 +108,8 @@ def numpy_answers(reward, scene, s, l=None):
 def entries(scene, s, l=None):
     """A case as pairs (label, numbers), as in onboard/conformance/README.md."""
     yield "ego", list(dataclasses.asdict(scene.ego).values())
-    for label, name in (("kappa", "kappa"), ("path_l", "l"), ("speed_limit",) * 2):
-        yield label, getattr(scene.path, name)
+    for name in ("kappa", "l", "speed_limit", "road_left", "road_right"):
+        yield "path_l" if name == "l" else name, getattr(scene.path, name)
     yield "num_valid", [scene.num_valid]
     yield "obstacles", [len(scene.obstacles)]
     for box in scene.obstacles:

@@ -61,6 +61,7 @@ def drawn(seed):
             points=points,
             speed_limit=draw(5.0, 30.0, len(points)),
             lane_width=draw(2.8, 4.0),
+            road_left=None if seed % 3 else draw(2.0, 9.0),
         ),
         "obstacles": others,
         "signals": signals,
@@ -85,7 +86,8 @@ def as_words(given):
     """The numbers that onboard/tests/build_scene.cpp reads, as a text."""
     ego, line = given["ego"], given["centre_line"]
     limits = np.broadcast_to(line.speed_limit, len(line.points))
-    numbers = [*vars(ego).values(), line.lane_width, len(line.points)]
+    edges = (-1.0 if x is None else x for x in (line.road_left, line.road_right))
+    numbers = [*vars(ego).values(), line.lane_width, *edges, len(line.points)]
     for (x, y), limit in zip(line.points, limits, strict=True):
         numbers += [x, y, limit]
     futures = given["predictions"] or [()] * len(given["obstacles"])

@@ -15,7 +15,9 @@ from rcirl_jax import units
 from rcirl_jax.export import load_weights
 from rcirl_jax.export.own_planner import features
 from rcirl_jax.export.own_planner.builder import plain_scene
+from rcirl_jax.export.own_planner.choose import admit
 from rcirl_jax.features import columns as f
+from rcirl_jax.planner.safety import Reason
 from rcirl_jax.units import NUM_TIMES
 from tests.helpers.own_planner import TOLERANCE, entries, error, numpy_answers
 from tests.onboard.programs import ONBOARD
@@ -69,6 +71,34 @@ def test_the_answers_are_those_of_the_numpy_file(cases):
         assert error(values, np.array(case.scores)) <= TOLERANCE
 
 
+def test_the_rulings_are_those_of_the_numpy_file(cases):
+    for name, made in scenes().items():
+        reason, obstacle, time = admit(plain_scene(made), *positions(cases[name]))
+        time = np.where(np.isfinite(time), time, -1.0)
+        found = np.stack([reason, obstacle, time], axis=1).ravel()
+        np.testing.assert_allclose(found, cases[name].rulings, rtol=1e-6, err_msg=name)
+
+
+def test_every_rule_is_broken_in_some_case(cases):
+    found = {int(x) for case in cases.values() for x in case.rulings[::3]}
+    assert found == set(Reason) - {Reason.NOT_FEASIBLE}
+
+
+def test_the_filter_is_compared_if_asked_for(cases, tmp_path):
+    said = answers(cases, tmp_path, lambda name, numbers: numbers)
+    assert checked(*said)[0] == 0
+    assert checked("--filter", *said)[2][0] == "free_road: 1137 numbers: expected 1146"
+
+    def whole(name, numbers):
+        rulings = list(cases[name].rulings)
+        rulings[0] += name == "follow"
+        return [*numbers, *rulings]
+
+    status, _, lines = checked("--filter", *answers(cases, tmp_path, whole))
+    assert status == 1
+    assert lines == ["follow: rulings: candidate 0, reason: 3: expected 2"]
+
+
 def test_every_column_takes_several_values(cases):
     found = {}
     for case in cases.values():
@@ -84,7 +114,7 @@ def answers(cases, folder, change):
     """A program that answers as the file says, but for what `change` does to it."""
     said = {}
     for name, case in cases.items():
-        numbers = [value for _, value, _ in case.expected(features_only=False)]
+        numbers = [value for _, value, _ in case.expected()]
         said[hashlib.sha256(case.given.encode()).hexdigest()] = change(name, numbers)
     path = folder / "answers.json"
     path.write_text(json.dumps(said))
@@ -170,7 +200,7 @@ def test_planted_faults_are_found(cases, tmp_path, monkeypatch, fault):
 def test_times_that_do_not_count_may_be_anything(cases, tmp_path):
     def change(name, numbers):
         case = cases[name]
-        counts = [c for *_, c in case.expected(features_only=False)]
+        counts = [c for *_, c in case.expected()]
         return [x if c else 7e7 for x, c in zip(numbers, counts, strict=True)]
 
     assert checked(*answers(cases, tmp_path, change))[0] == 0

@@ -9,7 +9,14 @@ import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.rank import ONLINE
-from rcirl_jax.planner.safety import SafetyConfig, Verdict, check, choose, first_contact
+from rcirl_jax.planner.safety import (
+    SafetyConfig,
+    Verdict,
+    check,
+    choose,
+    first_contact,
+    motion_of,
+)
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.sampling.sampler import as_candidates
 from rcirl_jax.types import Kind
@@ -25,9 +32,7 @@ def scene_and_candidates(seed):
     return made, sampled(jax.random.key(seed), made, ONLINE)
 
 
-contact = jax.jit(
-    lambda s, c: first_contact(s, jax.tree.map(jnp.transpose, c.trajectory), BARE)
-)
+contact = jax.jit(lambda s, c: first_contact(s, motion_of(c.trajectory), BARE))
 judge = jax.jit(lambda s, c: check(s, c))
 
 
@@ -177,7 +182,7 @@ def test_the_later_contact_is_preferred_and_scores_decide_the_rest():
         rss_margin=jnp.zeros(3),
     )
     assert int(choose(verdict, two, jnp.array([9.0, 0.0, 0.0]))[0]) == 1
-    some = verdict.replace(admissible=jnp.array([True, False, True]))
+    some = verdict._replace(admissible=jnp.array([True, False, True]))
     index, nothing = choose(some, two, jnp.array([1.0, 9.0, 2.0]))
     assert int(index) == 2
     assert not bool(nothing)

@@ -7,6 +7,8 @@
 //   columns.compute(scene, {s, l, count}, features);               // [K, T] -> [K, T, F]
 //   reward.score(features, count, columns.mask(scene), &workspace, values);
 //
+// A value says nothing of safety: rcirl/choose.hpp filters, values and chooses in one call.
+//
 // It computes what `rcirl_jax.features` does, within 1e-5. Computing allocates nothing,
 // throws nothing, takes no lock. The structs: rcirl/scene.hpp. The columns:
 // docs/features.md. Check your own implementation: onboard/conformance.
@@ -32,7 +34,28 @@ struct Candidates {
   const float* s = nullptr;  // [K, T] m, stations
   const float* l = nullptr;  // [K, T] m, lateral offsets; null: along the given path
   std::size_t count = 0;     // K
+  // [K] 0: the vehicle cannot drive it, which nothing here knows; null: it can drive all
+  const std::uint8_t* feasible = nullptr;
 };
+
+namespace detail {
+
+// Calls `each(first, lanes, x, known)` for every block of candidates: the first one's
+// number, how many, their points [T], and whether each has positions.
+template <typename Each>
+void for_each_block(const Scene& scene, const Candidates& candidates, const Each& each) {
+  const PathTable table = tabulated(scene.path);
+  for (std::size_t first = 0; first < candidates.count; first += kLanes) {
+    const std::size_t lanes = std::min(kLanes, candidates.count - first);
+    Point x[kTimes];
+    bool known[kLanes];
+    fill_block(candidates.s, candidates.l, first, lanes, x, known);
+    complete(scene, table, candidates.l == nullptr, x);
+    each(first, lanes, x, known);
+  }
+}
+
+}  // namespace detail
 
 // F with the columns of a weights file, in its order. Empty until it is made.
 class FeatureMap {
@@ -57,6 +80,12 @@ class FeatureMap {
   }
 
  private:
+  friend class Chooser;
+
+  // F of a block of candidates; returns how many were refused.
+  std::size_t write(const Scene& scene, std::size_t lanes, const detail::Point* x,
+                    const bool* known, float* features) const noexcept;
+
   friend Status feature_map(const std::vector<Feature>&, const std::string&, FeatureMap*);
 
   std::vector<detail::Column> columns_;  // [F]
@@ -102,29 +131,34 @@ inline std::size_t FeatureMap::compute(const Scene& scene, const Candidates& can
     std::fill(features, features + candidates.count * row, kNan);
     return candidates.count;
   }
-  const detail::PathTable table = detail::tabulated(scene.path);
   std::size_t refused = 0;
-  for (std::size_t first = 0; first < candidates.count; first += detail::kLanes) {
-    const std::size_t lanes = std::min(detail::kLanes, candidates.count - first);
-    detail::Point x[kTimes];
-    bool known[detail::kLanes];
-    detail::fill_block(candidates.s, candidates.l, first, lanes, x, known);
-    detail::complete(scene, table, candidates.l == nullptr, x);
-    for (std::size_t t = 0; t < kTimes; ++t) {
-      detail::Relations near;
-      detail::Lanes columns[detail::kNumColumns];
-      detail::relate(scene, x, t, &near);
-      detail::fill_columns(scene.ego, t, x[t], near, columns);
-      for (std::size_t k = 0; k < lanes; ++k) {
-        float* out = features + (first + k) * row + t * size();
-        for (std::size_t f = 0; f < size(); ++f) out[f] = columns[columns_[f]].at[k];
-      }
-    }
+  detail::for_each_block(scene, candidates,
+                         [&](std::size_t first, std::size_t lanes, const detail::Point* x,
+                             const bool* known) {
+                           refused += write(scene, lanes, x, known, features + first * row);
+                         });
+  return refused;
+}
+
+inline std::size_t FeatureMap::write(const Scene& scene, std::size_t lanes,
+                                     const detail::Point* x, const bool* known,
+                                     float* features) const noexcept {
+  const std::size_t row = kTimes * size();
+  for (std::size_t t = 0; t < kTimes; ++t) {
+    detail::Relations near;
+    detail::Lanes columns[detail::kNumColumns];
+    detail::relate(scene, x, t, &near);
+    detail::fill_columns(scene.ego, t, x[t], near, columns);
     for (std::size_t k = 0; k < lanes; ++k) {
-      float* out = features + (first + k) * row;
-      if (!known[k]) std::fill(out, out + row, kNan);
-      refused += !known[k];
+      float* out = features + k * row + t * size();
+      for (std::size_t f = 0; f < size(); ++f) out[f] = columns[columns_[f]].at[k];
     }
+  }
+  std::size_t refused = 0;
+  for (std::size_t k = 0; k < lanes; ++k) {
+    constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
+    if (!known[k]) std::fill(features + k * row, features + (k + 1) * row, kNan);
+    refused += !known[k];
   }
   return refused;
 }

@@ -5,8 +5,12 @@
 //   if (status.ok()) status = reward.check_features(names, units);
 //   if (!status.ok()) { log(status.message()); return; }
 //   rcirl::Workspace workspace = reward.workspace();           // one for each thread
+//   log(rcirl::describe(reward));                              // what it was trained for
 //   reward.score(features, count, {}, &workspace, values);     // [K, T, F] -> [K]
-//   std::size_t best = rcirl::best(values, count);             // count: none is usable
+//   std::size_t best = rcirl::best(values, count, admissible); // count: none is usable
+//
+// A value says nothing of safety. `admissible` [K] comes from a safety filter:
+// rcirl/safety.hpp has one, and rcirl/choose.hpp does all of it in one call.
 //
 // A reward with a prior cost goes on top of the planner's own values: where
 // `reward.has_prior_cost()`, call `reward.total(..., own, &workspace, values)`, not `score`.
@@ -67,6 +71,13 @@ class Reward {
   const std::vector<Feature>& features() const { return weights_.features; }  // [F]
   const std::vector<float>& times() const { return weights_.times; }          // [T] s
 
+  // What candidates may differ in: "speed", in s(t) along one path, for l was not trained;
+  // "path_speed", in l too.
+  const std::string& mode() const { return weights_.mode; }
+
+  // Features without effect: the training never saw them vary.
+  std::vector<std::string> unsupported() const;
+
   // Refuses columns that are not the file's, in the file's order and units.
   Status check_features(const std::vector<std::string>& names,
                         const std::vector<std::string>& units) const;
@@ -93,6 +104,8 @@ class Reward {
   // Whether V is made to be added to the value of an incumbent, and of which one.
   bool has_prior_cost() const { return !incumbent().empty(); }
   const std::string& incumbent() const { return weights_.prior_cost.incumbent; }
+  double lowest_gain() const { return weights_.prior_cost.low; }    // where nothing is familiar
+  double highest_gain() const { return weights_.prior_cost.high; }  // where all is
 
   // V_incumbent + gain V of trajectories, with a prior cost; higher is better.
   //
@@ -145,17 +158,48 @@ inline Status load(const std::string& path, Reward* reward) {
   return decode(std::string_view(data.data(), size), path, reward);
 }
 
-// Index of the largest value; `count` if no candidate has one.
-inline std::size_t best(const float* values, std::size_t count) noexcept {
+// Index of the largest value among the admissible, [K] bytes of 0 and 1 of a safety filter;
+// `count` if no admissible candidate has one. Null: all are admissible.
+inline std::size_t best(const float* values, std::size_t count,
+                        const std::uint8_t* admissible = nullptr) noexcept {
   std::size_t index = count;
   float most = -std::numeric_limits<float>::infinity();
   for (std::size_t k = 0; k < count; ++k) {
+    if (admissible != nullptr && admissible[k] == 0) continue;
     if (values[k] > most) {
       most = values[k];
       index = k;
     }
   }
   return index;
+}
+
+inline std::vector<std::string> Reward::unsupported() const {
+  std::vector<std::string> names;
+  for (std::size_t f = 0; f < features().size(); ++f) {
+    if (weights_.network.lower[f] >= weights_.network.upper[f]) names.push_back(features()[f].name);
+  }
+  return names;
+}
+
+// Lines on what the values mean and what they do not, for a log.
+inline std::string describe(const Reward& reward) {
+  std::string without, prior = "none", last = "0";
+  for (const std::string& name : reward.unsupported()) {
+    without += (without.empty() ? "" : ", ") + name;
+  }
+  if (reward.has_prior_cost()) {
+    prior = reward.incumbent() + ", gain " + detail::number_text(reward.lowest_gain()) + " to " +
+            detail::number_text(reward.highest_gain());
+  }
+  if (!reward.times().empty()) {
+    last = detail::number_text(static_cast<double>(reward.times().back()));
+  }
+  const bool speed = reward.mode() == "speed";
+  return "mode: " + reward.mode() + (speed ? ": l was not trained" : ": l was trained") +
+         "\nfeatures without effect: " + (without.empty() ? "none" : without) +
+         "\nprior cost: " + prior + "\ntimes: " + std::to_string(reward.times().size()) +
+         " from 0 to " + last + " s\nsafety: none: filter the candidates before you choose";
 }
 
 inline Status Reward::check_features(const std::vector<std::string>& names,

@@ -39,12 +39,31 @@ struct Ego {
   float width = 0.0f;   // m, to be set
 };
 
+constexpr float kUnknownEdgeM = 1e6f;  // m, a road's edge that is not known
+
+namespace detail {
+
+inline Stations everywhere(float value) {
+  Stations table{};
+  table.fill(value);
+  return table;
+}
+
+}  // namespace detail
+
 // The reference line and the given path; point p lies at station 2 p m.
 struct Path {
   Stations kappa{};  // 1/m, curvature of the reference line, left positive
   Stations l{};      // m, lateral offset of the given path
   // m/s, that the planner may drive: posted, for curves, braking for both
   Stations speed_limit{};
+  // m, lateral offsets of the road's edges, for the safety filter alone
+  Stations road_left = detail::everywhere(kUnknownEdgeM);
+  Stations road_right = detail::everywhere(-kUnknownEdgeM);
+
+  bool has_road() const {
+    return road_left[0] < kUnknownEdgeM && road_right[0] > -kUnknownEdgeM;
+  }
 };
 
 enum class ObstacleKind : std::uint8_t {
@@ -104,9 +123,14 @@ bool bad_path(const Path& path, const Report& report) {
   if (not_finite("path.kappa", path.kappa, report)) return true;
   if (not_finite("path.l", path.l, report)) return true;
   if (not_finite("path.speed_limit", path.speed_limit, report)) return true;
+  if (not_finite("path.road_left", path.road_left, report)) return true;
+  if (not_finite("path.road_right", path.road_right, report)) return true;
   for (std::size_t p = 0; p < kStations; ++p) {
-    const float limit = path.speed_limit[p];
+    const float limit = path.speed_limit[p], left = path.road_left[p];
     if (limit < 0.0f) return report("path.speed_limit", p, limit, ">= 0 m/s");
+    if (left < path.road_right[p]) {
+      return report("path.road_left", p, left, "at least road_right");
+    }
   }
   return false;
 }

@@ -142,6 +142,11 @@ class Builder {
     for (std::size_t p = kLongGrid - 1; p-- > 0;) {
       limit[p] = std::min(limit[p], std::sqrt(limit[p + 1] * limit[p + 1] + 2.0 * kLineStepM));
     }
+    const double lane = 0.5 * now_.line.lane_width;
+    const double left = now_.line.road_left < 0.0 ? lane : now_.line.road_left;
+    const double right = now_.line.road_right < 0.0 ? lane : now_.line.road_right;
+    scene->path.road_left.fill(narrow(left));
+    scene->path.road_right.fill(narrow(-right));
     for (std::size_t p = 0; p < kStations; ++p) {
       scene->path.kappa[p] = narrow(kappa[p]);
       scene->path.l[p] = narrow(l[p]);

@@ -30,6 +30,8 @@ struct CentreLine {
   std::vector<detail::XY> points;   // m, in driving direction
   std::vector<double> speed_limit;  // m/s, posted: one, or one for each point, from it on
   double lane_width = 3.6;          // m
+  // m from the line to the road's edges, for the safety filter; below 0: those of the lane
+  double road_left = -1.0, road_right = -1.0;
 };
 
 struct Pose {
@@ -140,6 +142,9 @@ inline std::string wrong_input(const Surroundings& now) {
   if (!(now.line.lane_width > 0.0 && std::isfinite(now.line.lane_width))) {
     return fault("line.lane_width", now.line.lane_width, "over 0 m");
   }
+  wrong = wrong_number(
+      "line", {{"road_left", now.line.road_left}, {"road_right", now.line.road_right}});
+  if (!wrong.empty()) return wrong;
   for (std::size_t n = 0; n < now.others.size(); ++n) {
     const Other& o = now.others[n];
     const std::string name = index_text("others", n);

@@ -65,7 +65,8 @@ GRID_BLOCK = 256  # points: grids are a multiple, so that few sizes compile
 LONG_GRID_M = np.arange(
     0.0, (NUM_STATIONS - 1) * STATION_STEP_M + LOOK_AHEAD_M + 1e-6, STATION_STEP_M
 )
-PATH = ("kappa", "l", "speed_limit")  # what plain scenes have of a path
+# what plain scenes have of a path
+PATH = ("kappa", "l", "speed_limit", "road_left", "road_right")
 
 
 class Parts(flax.struct.PyTreeNode, kw_only=True):

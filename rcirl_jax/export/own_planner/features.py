@@ -1,12 +1,17 @@
 """The feature map F from plain numbers, float32. Needs numpy only.
 
-This file, the package's own F (`rcirl_jax/features/columns.py`) and the constants
-(`rcirl_jax/units.py`) may be copied into a planner's repository, beside `reader.py`.
-docs/own_planner.md describes the structs and docs/features.md every column.
+This file, the package's own F (`rcirl_jax/features/columns.py`), the safety filter
+(`rcirl_jax/planner/safety.py`), the constants (`rcirl_jax/units.py`) and `choose.py`
+may be copied into a planner's repository, beside `reader.py`. docs/own_planner.md
+describes the structs and docs/features.md every column.
 
     scene = Scene(ego=Ego(...), path=Path(...), obstacles=[Obstacle(...), ...])
+    choice = choose(reward, scene, s, l)                            # s, l [K, T] m
+
+`choose` filters what is unsafe; a value alone says nothing of it:
+
     columns = FeatureMap(reward.names, reward.units)
-    values = reward.value(columns(scene, s, l), scene.time_valid)   # s, l [K, T] m
+    values = reward.value(columns(scene, s, l), scene.time_valid)
 
 Everything is in the scene's Frenet frame, SI units and radians: station `s` along the
 reference line, 0 at the ego's centre now; lateral offset `l` from it, left positive;
@@ -32,6 +37,7 @@ Array = np.ndarray  # float32 unless said otherwise
 HORIZON_S, NUM_TIMES, TIMES_S = units.HORIZON_S, units.NUM_TIMES, units.TIMES_S
 STATION_STEP_M, NUM_STATIONS = units.STATION_STEP_M, units.NUM_STATIONS
 Kind = units.Kind
+FAR_M = 1e6  # m, where the road's edges are taken to be if they are not known
 BOX = ("s_lower", "s_upper", "l_lower", "l_upper", "speed", "valid")  # [T] each
 
 # unit of every column
@@ -74,6 +80,9 @@ class Path:
     l: Array  # [P] m, lateral offset of the given path
     # [P] m/s, that the planner may drive: posted, for curves, braking for both
     speed_limit: Array
+    # [P] m, lateral offsets of the road's edges, for the filter alone; None: not known
+    road_left: Array | None = None
+    road_right: Array | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -87,6 +96,14 @@ class Obstacle:
     l_upper: Array  # [T] m, lateral offset of the left side
     speed: Array  # [T] m/s along the reference line, signed
     valid: Array  # [T] bool, there at that time (STOP: demands a stop)
+
+
+_ZEROS = np.zeros(NUM_TIMES, np.float32)
+NOTHING = Obstacle(
+    kind=Kind.NONE,
+    **dict.fromkeys(BOX[:-1], _ZEROS),
+    valid=np.zeros(NUM_TIMES, bool),
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -115,12 +132,16 @@ def checked(scene: Scene) -> Scene:
     for name in ("length", "width"):
         if not ego[name] > 0.0:
             _fail(f"ego.{name}", ego[name], "over 0 m")
-    names = [f.name for f in dataclasses.fields(Path)]
-    path = {
-        name: _numbers(f"path.{name}", getattr(scene.path, name), (NUM_STATIONS,))
-        for name in names
-    }
+    unknown = {"road_left": FAR_M, "road_right": -FAR_M}
+    path = {}
+    for name in (f.name for f in dataclasses.fields(Path)):
+        given = getattr(scene.path, name)
+        if given is None and name in unknown:
+            given = np.full(NUM_STATIONS, unknown[name])
+        path[name] = _numbers(f"path.{name}", given, (NUM_STATIONS,))
     _every("path.speed_limit", path["speed_limit"], path["speed_limit"] >= 0, ">= 0")
+    left, right = path["road_left"], path["road_right"]
+    _every("path.road_left", left, left >= right, "at least road_right")
     if not 1 <= scene.num_valid <= NUM_TIMES:
         _fail("num_valid", scene.num_valid, f"1 to {NUM_TIMES}")
     boxes = [_box(f"obstacles[{n}]", box) for n, box in enumerate(scene.obstacles)]
@@ -170,6 +191,45 @@ def _fail(field: str, value: object, expected: str) -> NoReturn:
     raise FeatureError(f"scene: {field}: {str(value)[:80]}: expected {expected}")
 
 
+def driven(
+    scene: Scene, s: Array, l: Array | None = None
+) -> tuple[Any, Any, f.PathView]:
+    """Return a scene in arrays, the motion of its candidates, and the path under them.
+
+    Args:
+      scene: one planning frame.
+      s: [K, T] m, stations at `TIMES_S`.
+      l: [K, T] m, lateral offsets; None: all drive along the given path.
+
+    Returns:
+      The scene with leaves as in `rcirl_jax.types`, of obstacles at least one, which
+      may be empty; a motion with leaves s, v, a, j, l, dl, ddl [K, T]; the path at s.
+
+    Raises:
+      FeatureError: a number is missing, not finite or out of range.
+    """
+    scene, count = checked(scene), np.shape(s)[0] if np.ndim(s) else 0
+    s = _numbers("candidates.s", s, (count, NUM_TIMES))
+    if l is not None:
+        l = _numbers("candidates.l", l, (count, NUM_TIMES))
+    ego, boxes = scene.ego, scene.obstacles or [NOTHING]
+    obstacles = SimpleNamespace(
+        kind=np.array([box.kind for box in boxes]),
+        **{n: np.array([getattr(box, n) for box in boxes]) for n in BOX},
+    )
+    plain = SimpleNamespace(ego=ego, path=scene.path, obstacles=obstacles)
+    with np.errstate(over="ignore", invalid="ignore"):
+        view = f.path_view(plain, s)
+        v, a, j = f.differentiate(s, ego.v, ego.a, scene.time_valid)
+        if l is None:
+            l = view.l
+            given = zip((ego.dl, ego.ddl), (view.dl, view.ddl), strict=True)
+            dl, ddl = (np.where(f.FIRST, first, rest) for first, rest in given)
+        else:
+            dl, ddl = f.lateral_derivatives(s, l, ego.dl, ego.ddl)
+    return plain, SimpleNamespace(s=s, v=v, a=a, j=j, l=l, dl=dl, ddl=ddl), view
+
+
 class FeatureMap:
     """F with the columns of a weights file, in its order."""
 
@@ -194,35 +254,18 @@ class FeatureMap:
         Raises:
           FeatureError: a number is missing, not finite or out of range.
         """
-        scene, count = checked(scene), np.shape(s)[0] if np.ndim(s) else 0
-        s = _numbers("candidates.s", s, (count, NUM_TIMES))
-        if l is not None:
-            l = _numbers("candidates.l", l, (count, NUM_TIMES))
-        ego, path, boxes = scene.ego, scene.path, scene.obstacles
-        edges = {"road_left": path.l, "road_right": path.l}  # read by no column
+        plain, point, view = driven(scene, s, l)
+        s = point.s
         with np.errstate(over="ignore", invalid="ignore"):
-            road = SimpleNamespace(path=SimpleNamespace(**vars(path), **edges))
-            view = f.path_view(road, s)
-            v, a, j = f.differentiate(s, ego.v, ego.a, scene.time_valid)
-            if l is None:
-                l = view.l
-                given = zip((ego.dl, ego.ddl), (view.dl, view.ddl), strict=True)
-                dl, ddl = (np.where(f.FIRST, first, rest) for first, rest in given)
-            else:
-                dl, ddl = f.lateral_derivatives(s, l, ego.dl, ego.ddl)
-            others = SimpleNamespace(
-                kind=np.array([box.kind for box in boxes]),
-                **{n: np.array([getattr(box, n) for box in boxes]) for n in BOX},
-            )
-            slots = f.slots(ego, others) if boxes else ()
             start = np.full_like(s[:, :1], -f.BEFORE_M)
             before = np.concatenate([start, s[:, :-1]], axis=1)
-            point = SimpleNamespace(s=s, v=v, a=a, j=j, l=l, dl=dl, ddl=ddl)
             frame = f.Frame(
                 time=np.broadcast_to(TIMES_S, s.shape),
-                advance=s - ego.s,
+                advance=s - plain.ego.s,
                 point=point,
-                relations=f.relate(slots, s, l, v, before),
+                relations=f.relate(
+                    f.slots(plain.ego, plain.obstacles), s, point.l, point.v, before
+                ),
                 path=view,
                 kappa=view.curvature(point),
             )

@@ -32,6 +32,7 @@ namespace detail {
 struct Weights {
   std::string sha256;  // of the body; names this reward
   std::string preset;
+  std::string mode = "speed";         // or "path_speed": candidates differ in l too
   std::vector<Feature> features;      // [F]
   std::vector<float> times;           // [T] s
   std::vector<float> training_range;  // [2, F] ends of the training's range
@@ -238,6 +239,9 @@ inline bool decode_body(Checks& is, const Node& root, Weights* weights) {
         is.plain("provenance", *body[12], kMaxDepth))) {
     return false;
   }
+  const Node* mode = is.find(*body[12], "mode");
+  const bool lateral = mode != nullptr && mode->kind == Kind::kText && mode->bytes == "path_speed";
+  weights->mode = lateral ? "path_speed" : "speed";
   weights->training_range = std::move(training_range.values);
   network.scene_gating = std::move(scene_gating.values);
   network.gamma = std::move(gamma.values);

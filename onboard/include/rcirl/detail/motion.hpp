@@ -25,7 +25,7 @@ constexpr std::size_t kSlopePoints = 3;  // grid points on each side of a slope 
 // A path with its slopes, point by point, so that one look-up finds all.
 struct PathTable {
   // rows of eight, so that a look-up is a few vector instructions
-  enum Column { kL, kDl, kDdl, kKappa, kDkappa, kLimit, kColumns = 8 };
+  enum Column { kL, kDl, kDdl, kKappa, kDkappa, kLimit, kRoadLeft, kRoadRight, kColumns };
 
   float at[kStations][kColumns];
 };
@@ -49,6 +49,8 @@ inline PathTable tabulated(const Path& path) {
     row[PathTable::kKappa] = path.kappa[p];
     row[PathTable::kDkappa] = table_slope(path.kappa, p, 1);
     row[PathTable::kLimit] = path.speed_limit[p];
+    row[PathTable::kRoadLeft] = path.road_left[p];
+    row[PathTable::kRoadRight] = path.road_right[p];
   }
   return table;
 }
@@ -58,6 +60,7 @@ struct Point {
   Lanes s, v, a, j;   // m, m/s, m/s^2, m/s^3
   Lanes l, dl, ddl;   // m, 1, 1/m
   Lanes speed_limit;  // m/s, at the station
+  Lanes road_left, road_right;  // m, at the station
   Lanes kappa;        // 1/m, of the path driven
 };
 
@@ -140,6 +143,8 @@ inline void look_up(const PathTable& table, bool on_path, Point* x, Lanes* kappa
     kappa->at[k] = row[PathTable::kKappa];
     dkappa->at[k] = row[PathTable::kDkappa];
     x->speed_limit.at[k] = row[PathTable::kLimit];
+    x->road_left.at[k] = row[PathTable::kRoadLeft];
+    x->road_right.at[k] = row[PathTable::kRoadRight];
   }
 }
 

@@ -1,0 +1,109 @@
+"""The safety filter for other people's planners, numpy and C++, against JAX."""
+
+import functools
+
+import jax
+import numpy as np
+import pytest
+
+from rcirl_jax.export.own_planner.builder import plain_scene
+from rcirl_jax.export.own_planner.choose import admit
+from rcirl_jax.export.own_planner.features import FeatureError
+from rcirl_jax.planner.safety import Reason, SafetyConfig, check, explain
+from tests.helpers import drawn_scenes, own_planner
+from tests.onboard.programs import built, run
+
+SCENES, EACH = 250, 12
+ROUNDING = 1e-3  # m, m/s, m/s^2 by which limits move for rulings that rounding decides
+
+
+@pytest.fixture(scope="module")
+def reader(tmp_path_factory):
+    return built(tmp_path_factory.mktemp("onboard"), "reader") / "reader"
+
+
+def moved(by):
+    """The filter's limits, stricter by so much."""
+    usual = SafetyConfig()
+    wider = ("margin_along", "margin_across", "line_margin", "standstill")
+    lower = ("speed_slack", "max_lateral_acceleration")
+    return SafetyConfig(
+        rss_recovery=usual.rss_recovery + by,
+        **{name: getattr(usual, name) + by for name in wider},
+        **{name: getattr(usual, name) - by for name in lower},
+    )
+
+
+@functools.cache
+def judge(config, on_path):
+    def of_one(scene, s, l):
+        given = own_planner.candidates(scene, s, None if on_path else l)
+        return check(scene, given, config).admissible, explain(scene, given, config)
+
+    return jax.jit(jax.vmap(of_one))
+
+
+def places(scenes, obstacle):
+    """Places among the obstacles that a plain scene keeps."""
+    kept = (scenes.obstacles.kind != 0) & scenes.obstacles.valid.any(axis=2)
+    place = np.cumsum(kept, axis=1) - 1
+    found = np.take_along_axis(place, np.maximum(obstacle, 0), axis=1)
+    return np.where(obstacle < 0, -1, found)
+
+
+def in_cpp(reader, folder, cases):
+    """Rulings [n, K, 3] of the cases."""
+    file = folder / "cases"
+    np.concatenate([own_planner.as_numbers(*case) for case in cases]).tofile(file)
+    found = np.frombuffer(run(reader, "admit", file), np.float32)
+    return found.reshape(len(cases), -1, 3)
+
+
+@pytest.mark.parametrize("on_path", [True, False])
+def test_rulings_on_random_scenes_are_those_of_jax(reader, tmp_path, on_path):
+    scenes = drawn_scenes.scenes(np.random.default_rng(5), SCENES)
+    s, l = drawn_scenes.candidates(np.random.default_rng(6), scenes, EACH)
+    told = []
+    for config in (SafetyConfig(), moved(-ROUNDING), moved(ROUNDING)):
+        admissible, found = judge(config, on_path)(scenes, s, l)
+        reason, obstacle, time = (np.asarray(x) for x in found)
+        np.testing.assert_array_equal(reason == Reason.NONE, admissible)
+        time = np.where(np.isfinite(time), time, -1.0)
+        told.append(np.stack([reason, places(scenes, obstacle), time], axis=2))
+    wanted, looser, stricter = told
+    sure = (looser == stricter).all(axis=2)
+    assert sure.mean() > 0.97
+    counts = np.bincount(wanted[..., 0].astype(int).ravel(), minlength=8)
+    never = {Reason.NOT_FEASIBLE, *([Reason.ROAD] if on_path else [])}
+    assert all(counts[x] >= 5 for x in set(Reason) - never), counts
+    cases = []
+    for n in range(SCENES):
+        plain = plain_scene(jax.tree.map(lambda x, n=n: x[n], scenes))
+        cases.append((plain, s[n], None if on_path else l[n]))
+    in_numpy = np.stack([np.stack(admit(*case), axis=1) for case in cases])
+    in_numpy = np.where(np.isfinite(in_numpy), in_numpy, -1.0)
+    for rulings in (in_numpy, in_cpp(reader, tmp_path, cases)):
+        np.testing.assert_allclose(rulings[sure], wanted[sure], rtol=1e-6)
+
+
+def test_offsets_need_the_edges_of_the_road():
+    scenes = drawn_scenes.scenes(np.random.default_rng(5), 1)
+    s, l = drawn_scenes.candidates(np.random.default_rng(6), scenes, 2)
+    plain = plain_scene(jax.tree.map(lambda x: x[0], scenes))
+    object.__setattr__(plain.path, "road_left", None)
+    assert len(admit(plain, s[0]).reason) == 2
+    with pytest.raises(
+        FeatureError, match="road_right: None: expected edges, for cand"
+    ):
+        admit(plain, s[0], l[0])
+
+
+def test_what_the_vehicle_cannot_drive_is_the_first_reason():
+    scenes = drawn_scenes.scenes(np.random.default_rng(5), 1)
+    s, _ = drawn_scenes.candidates(np.random.default_rng(6), scenes, 2)
+    plain = plain_scene(jax.tree.map(lambda x: x[0], scenes))
+    found = admit(plain, s[0], feasible=np.array([False, True]))
+    assert found.reason[0] == Reason.NOT_FEASIBLE
+    assert found.reason[1] != Reason.NOT_FEASIBLE
+    with pytest.raises(FeatureError, match=r"feasible: int64 \(1,\): expected bool"):
+        admit(plain, s[0], feasible=np.array([1]))
