@@ -32,6 +32,8 @@ from rcirl_jax.data.inputs import (
 )
 from rcirl_jax.data.plans import MAX_PLANS, plan_of
 from rcirl_jax.data.quality import QualityReport, remedies
+from rcirl_jax.data.readers.long_logs import AFTER_S, BEFORE_S
+from rcirl_jax.data.readers.tables.rows import DAY_S
 from rcirl_jax.data.scenes.collect import CHUNK, Collector, assemble
 from rcirl_jax.data.scenes.config import CollectConfig, SignalChecks
 from rcirl_jax.data.scenes.lanes import LaneGraph
@@ -123,32 +125,52 @@ class End:
     group: str
 
     def goes_on(self, other: "End") -> bool:
-        """True if the other is the same vehicle a step later or earlier."""
-        apart = abs(other.t - self.t)
+        """True if the other is the same vehicle a step later or earlier.
+
+        Times of a day that nobody names go on at midnight.
+        """
+        first, second = (other, self) if self.is_begin else (self, other)
+        apart = second.t - first.t
+        if max(self.t, other.t) < 2.0 * DAY_S:
+            apart %= DAY_S
         near = np.hypot(other.x - self.x, other.y - self.y)
         reach = AWAY_M + 1.5 * max(self.speed, other.speed) * apart
-        first, second = (other, self) if self.is_begin else (self, other)
         return (
             self.id == other.id
             and self.is_begin != other.is_begin
-            and first.t < second.t <= first.t + ENDS_S
+            and 0.0 < apart <= ENDS_S
             and bool(near <= reach)
         )
 
+    def keys(self, around: Sequence[int] = (0,)) -> list[tuple[str, int]]:
+        """Returns id and second of the day, or those of other seconds beside it."""
+        second = int(self.t // ENDS_S)
+        return [(self.id, (second + k) % round(DAY_S / ENDS_S)) for k in around]
+
 
 def ends_of(recording: Recording, log: str) -> Iterator[End]:
-    """Yields the vehicles that may drive on in a recording before or after."""
+    """Yields the vehicles that may drive on in a recording before or after.
+
+    Of a piece of a log only where the log itself begins or ends, which is where the
+    rows around its scenes are cut short.
+    """
     vehicles = [x for x in recording.tracks if x.kind == Kind.VEHICLE]
-    if recording.start_s is None or recording.piece_of or not vehicles:
+    if recording.start_s is None or not vehicles:
         return
-    ends = min(x.t[0] for x in vehicles), max(x.t[-1] for x in vehicles)
+    low, high = recording.scenes_within or (-np.inf, np.inf)
+    begin, end = min(x.t[0] for x in vehicles), max(x.t[-1] for x in vehicles)
+    sides = []
+    if begin > low - BEFORE_S + ENDS_S:
+        sides.append((0, begin))
+    if end < high + AFTER_S - ENDS_S:
+        sides.append((-1, end))
     for track in vehicles:
         group = _group(recording, track, log)
-        for row, is_begin in ((0, True), (-1, False)):
-            if abs(track.t[row] - ends[row]) <= ENDS_S:
+        for row, edge in sides:
+            if abs(track.t[row] - edge) <= ENDS_S:
                 yield End(
                     id=track.id.partition("#")[0],
-                    is_begin=is_begin,
+                    is_begin=row == 0,
                     t=recording.start_s + float(track.t[row]),
                     x=recording.origin[0] + float(track.x[row]),
                     y=recording.origin[1] + float(track.y[row]),
@@ -185,6 +207,8 @@ class RecordingScenes:
     input: str = ""  # the file it was read from
     plan: dict | None = None  # of the site, of the first recordings
     ends: Sequence[End] = ()
+    # whether vehicles that drive on in another recording cannot be told
+    has_no_clock: bool = False
     progress: float | None = None  # share of that file read after it, if known
 
 
@@ -235,6 +259,7 @@ def scenes_of(
         sha256=hashlib.sha256((digest(recording) + repr(config)).encode()).hexdigest(),
         log=log,
         ends=tuple(ends_of(recording, log)),
+        has_no_clock=recording.start_s is None and recording.group is None,
         refused=recording.refused,
         progress=recording.progress,
     )
@@ -351,6 +376,25 @@ def _numbers(table: dict[str, int], names: Iterable[str]) -> np.ndarray:
     return np.array([table.setdefault(name, len(table)) for name in names], np.int32)
 
 
+class Unions:
+    """Names that belong together, each union known by one of them."""
+
+    def __init__(self) -> None:
+        self._first: dict[str, str] = {}
+
+    def of(self, name: str) -> str:
+        """Returns the name of the union that a name is in."""
+        while (first := self._first.get(name, name)) != name:
+            name = first
+        return name
+
+    def join(self, one: str, other: str) -> None:
+        """Makes one of two unions, called as the first."""
+        one, other = self.of(one), self.of(other)
+        if one != other:
+            self._first[other] = one
+
+
 class _Import:
     """State of one import: names, quality, the open shard."""
 
@@ -371,9 +415,14 @@ class _Import:
         self.lineage: list[dict] = []
         self.logs: set[str] = set()  # that scenes come from
         self.plans: list[dict] = []
-        # of vehicles that may drive on in another recording, by the log's id
-        self.ends: dict[str, list[End]] = collections.defaultdict(list)
-        self.driven_on = 0  # vehicles that do
+        # of vehicles that may drive on in another recording, by `End.keys`
+        self.ends: dict[tuple[str, int], list[End]] = collections.defaultdict(list)
+        self.one_side = Unions()  # of groups with vehicles in common
+        # vehicle that does -> (vehicle, group) of an earlier recording
+        self.renamed: dict[str, tuple[str, str]] = {}
+        self.met: set[str] = set()  # vehicles, by the names that they came with
+        self.driven_on: set[str] = set()  # likewise, those with an earlier recording
+        self.without_clock: set[str] = set()  # logs
         committed = writer.committed()
         self.next_shard = len(committed)
         self.done = collections.deque(x for shard in committed for x in shard.lineage)
@@ -427,25 +476,37 @@ class _Import:
 
     def _driving_on(self, made: RecordingScenes) -> RecordingScenes:
         """Gives vehicles of a stream cut into files one name and group in all."""
-        same: dict[str, tuple[str, str]] = {}
         for end in made.ends:
-            for known in self.ends[end.id]:
-                if known.goes_on(end) and known.vehicle != end.vehicle:
-                    same.setdefault(end.vehicle, (known.vehicle, known.group))
-        self.driven_on += len(same)
+            vehicle, group = self._now_called(end.vehicle, end.group)
+            for key in end.keys((-1, 0, 1)):
+                for known in self.ends.get(key, ()):
+                    if known.vehicle == vehicle or not known.goes_on(end):
+                        continue
+                    self.driven_on.add(end.vehicle)
+                    if end.vehicle not in self.met:
+                        vehicle, group = known.vehicle, known.group
+                        self.renamed[end.vehicle] = vehicle, group
+                        self.met.add(end.vehicle)
+                    else:  # out of order: it has two names already
+                        self.one_side.join(group, known.group)
         for end in made.ends:
-            vehicle, group = same.get(end.vehicle, (end.vehicle, end.group))
+            vehicle, group = self._now_called(end.vehicle, end.group)
             kept = dataclasses.replace(end, vehicle=vehicle, group=group)
-            self.ends[end.id].append(kept)
-        if not same:
-            return made
+            self.ends[end.keys()[0]].append(kept)
+        self.met.update(made.vehicles, (end.vehicle for end in made.ends))
+        if made.has_no_clock:
+            self.without_clock.add(made.log)
         pairs = [
-            same.get(vehicle, (vehicle, group))
+            self._now_called(vehicle, group)
             for vehicle, group in zip(made.vehicles, made.groups, strict=True)
         ]
         return dataclasses.replace(
             made, vehicles=[x for x, _ in pairs], groups=[x for _, x in pairs]
         )
+
+    def _now_called(self, vehicle: str, group: str) -> tuple[str, str]:
+        """Returns a vehicle's name and group in the recording that met it first."""
+        return self.renamed.get(vehicle, (vehicle, group))
 
     def _count(self, entry: dict) -> None:
         self.quality.merge(entry["quality"])
@@ -453,10 +514,14 @@ class _Import:
 
     def _said_of_streams(self) -> str:
         """Returns the end of a line on vehicles in several recordings."""
-        count = self.driven_on
-        if not count:
-            return ""
-        return f"; {count} vehicles drive on from one recording to the next: one each"
+        said = ""
+        if count := len(self.driven_on):
+            said = (
+                f"; {count} vehicles drive on from one recording to the next: one each"
+            )
+        if len(self.without_clock) > 1:
+            said += "; the logs say no time of day: files of one stream cannot be told"
+        return said
 
     def _close_shard(self) -> None:
         if self.pending:
@@ -525,9 +590,13 @@ class _Import:
             raise InputError(f"import: 0 scenes kept of {quality.tracks} tracks: {why}")
         cut_by = self._split_one_group()
         self._close_shard()
+        sides = {group: self.one_side.of(group) for group in self.sizes}
+        for group in self.sizes:
+            self.one_side.join(group.rpartition(MINUTE)[0] or group, group)
+        wholes = {group: self.one_side.of(group) for group in self.sizes}
         splits, kept = split_wholes(
             self.sizes,
-            {group: group.rpartition(MINUTE)[0] or group for group in self.sizes},
+            (wholes, sides),
             test_fraction=self.config.test_fraction,
             seed=self.config.split_seed,
         )

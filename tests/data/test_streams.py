@@ -1,16 +1,22 @@
 """Files cut from one stream: a vehicle that drives on is one, in one split."""
 
+import dataclasses
+import re
+
 import numpy as np
 import pytest
 
-from rcirl_jax import import_logs, read_logs
+from rcirl_jax import import_logs, open_dataset, read_logs
+from rcirl_jax.data.importing import ImportConfig
+from rcirl_jax.data.importing import import_logs as import_recordings
+from rcirl_jax.data.scenes.config import CollectConfig
 from tests.helpers.driven_roads import crossing, highway
 
 
-def stream(shift=0.0):
+def stream(shift=0.0, cars=60):
     """Rows t, id, x, y of cars that start every 1.4 s and drive for 40 s."""
     rows = []
-    for car in range(60):
+    for car in range(cars):
         for k in range(400):
             t = 1.4 * car + 0.1 * k
             s = 14.0 * 0.1 * k + 6.0 * np.sin(0.3 * 0.1 * k + car)
@@ -18,41 +24,129 @@ def stream(shift=0.0):
     return rows
 
 
-def written(folder, name, rows):
+def written(folder, name, rows, clock=lambda t: f"{7000.0 + t:.1f}"):
     lines = ["t,id,x,y"]
-    lines += [f"{7000.0 + t:.1f},{i},{x:.2f},{y:.2f}" for t, i, x, y in rows]
+    lines += [f"{clock(t)},{i},{x:.2f},{y:.2f}" for t, i, x, y in rows]
     (folder / name).write_text("\n".join(lines) + "\n")
 
 
-@pytest.mark.parametrize("order", ["ab", "ba"])
-def test_a_stream_cut_into_two_files(tmp_path, order):
-    """The second file may be named before the first."""
-    names = dict(zip("ab", (f"{letter}.csv" for letter in order), strict=True))
-    logs = tmp_path / "logs"
-    logs.mkdir()
-    rows = stream()
-    written(logs, names["a"], [row for row in rows if row[0] < 60.0])
-    written(logs, names["b"], [row for row in rows if row[0] >= 60.0])
-    cut = {row[1] for row in rows if row[0] < 60.0}
-    cut &= {row[1] for row in rows if row[0] >= 60.0}
-    dataset = import_logs(logs, tmp_path / "data", format="csv", test_fraction=0.5)
+def cut(folder, names, edges, **options):
+    """The stream in a file for each name, in the order of time."""
+    folder.mkdir()
+    rows = stream(cars=60 if len(edges) == 1 else 180)
+    ends = zip([0.0, *edges], [*edges, 1e9], strict=True)
+    for name, (low, high) in zip(names, ends, strict=True):
+        own = [row for row in rows if low <= row[0] < high]
+        written(folder, f"{name}.csv", own, **options)
+    return folder
+
+
+def sides(dataset):
+    """The log's ids of the vehicles of each split."""
+    names = dataset.manifest.vehicles
+    splits = ("train", "test")
+    numbers = [np.unique(dataset.load(split).vehicle).tolist() for split in splits]
+    return [{names[n].rpartition(":")[2] for n in side} for side in numbers]
+
+
+def before_midnight(t):
+    """A time of day, 60 s after the stream began at midnight."""
+    seconds = (t - 60.0) % 86400.0
+    return f"{seconds // 3600:02.0f}:{seconds // 60 % 60:02.0f}:{seconds % 60:04.1f}"
+
+
+TOML = """
+long_bytes = {long_bytes}
+[columns]
+t = "t"
+id = "id"
+x = "x"
+y = "y"
+"""
+
+
+@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+@pytest.mark.parametrize(
+    ("names", "edges", "options"),
+    [
+        ("ab", [60.0], {}),
+        ("ba", [60.0], {}),  # the second file may be named before the first
+        ("acb", [85.0, 170.0], {}),  # the last meets a vehicle with two names
+        ("ab", [60.0], {"clock": before_midnight}),
+    ],
+    ids=["", "second first", "middle last", "over midnight"],
+)
+def test_a_stream_cut_into_files(tmp_path, names, edges, options, long_bytes):
+    logs, source = cut(tmp_path / "logs", names, edges, **options), tmp_path / "s.toml"
+    source.write_text(TOML.format(long_bytes=long_bytes))
+    dataset = import_logs(
+        logs,
+        tmp_path / "data",
+        format="csv",
+        source=source,
+        test_fraction=0.5,
+        stride_s=4.0,
+    )
+    train, test = sides(dataset)
+    assert train
+    assert test
+    assert not train & test
+    rows = stream(cars=180)
+    of_file = [{row[1] for row in rows if row[0] < edge} for edge in edges]
+    after = [{row[1] for row in rows if row[0] >= edge} for edge in edges]
+    both = sum(len(a & b) for a, b in zip(of_file, after, strict=True))
+    said = dataset.manifest.import_flags["split_by"]
+    found = re.search(r"(\d+) vehicles drive on from one recording", said)
+    assert found
+    assert both - len(edges) * 2 <= int(found[1]) <= both
+
+
+def test_one_name_in_all_files(tmp_path):
+    logs = cut(tmp_path / "logs", "ab", [60.0])
+    dataset = import_logs(
+        logs, tmp_path / "data", format="csv", test_fraction=0.5, stride_s=4.0
+    )
     every, vehicles = dataset.load(None), dataset.manifest.vehicles
     where = {}
     for vehicle, recording in zip(every.vehicle, every.recording, strict=True):
         where.setdefault(int(vehicle), set()).add(int(recording))
-    both = {
-        vehicles[v].rpartition(":")[2] for v, seen in where.items() if len(seen) > 1
-    }
-    assert len(both) > 10
-    assert both <= {str(car) for car in cut}
-    sides = [set(dataset.load(split).vehicle.tolist()) for split in ("train", "test")]
-    assert all(sides)
-    assert not sides[0] & sides[1]
-    # nobody who drives on is two vehicles
+    assert sum(len(seen) > 1 for seen in where.values()) > 10
     bare = [vehicles[v].rpartition(":")[2] for v in where]
     assert sorted(set(bare)) == sorted(bare)
+
+
+@pytest.mark.parametrize("has_clock", [True, False])
+def test_recordings_of_any_format(tmp_path, has_clock):
+    """Groups that a log declares, a place and a time of its own for each recording."""
+    logs = cut(tmp_path / "logs", "ab", [60.0])
+
+    def recordings():
+        for number, made in enumerate(read_logs(logs, format="csv")):
+            move = 100.0 * number
+            tracks = [dataclasses.replace(x, x=x.x - move) for x in made.tracks]
+            lanes = [
+                dataclasses.replace(x, centre=x.centre - np.array([move, 0.0]))
+                for x in made.lanes
+            ]
+            yield dataclasses.replace(
+                made,
+                tracks=tuple(tracks),
+                lanes=tuple(lanes),
+                origin=(made.origin[0] + move, made.origin[1]),
+                group=made.name if has_clock else None,
+                start_s=made.start_s if has_clock else None,
+            )
+
+    collect = CollectConfig(stride_s=4.0)
+    config = ImportConfig(format="any", test_fraction=0.5, collect=collect)
+    import_recordings(recordings(), tmp_path / "data", config)
+    dataset = open_dataset(tmp_path / "data")
+    train, test = sides(dataset)
     said = dataset.manifest.import_flags["split_by"]
-    assert f"{len(cut)} vehicles drive on from one recording to the next" in said
+    unknown = "the logs say no time of day: files of one stream cannot be told"
+    assert (not train & test) == has_clock
+    assert ("vehicles drive on" in said) == has_clock
+    assert (unknown in said) == (not has_clock)
 
 
 def test_ids_that_another_file_uses_again_are_others(tmp_path):
@@ -61,7 +155,9 @@ def test_ids_that_another_file_uses_again_are_others(tmp_path):
     logs.mkdir()
     written(logs, "a.csv", [row for row in stream() if row[0] < 60.0])
     written(logs, "b.csv", [row for row in stream(900.0) if row[0] >= 60.0])
-    dataset = import_logs(logs, tmp_path / "data", format="csv", test_fraction=0.5)
+    dataset = import_logs(
+        logs, tmp_path / "data", format="csv", test_fraction=0.5, stride_s=4.0
+    )
     assert "drive on" not in dataset.manifest.import_flags["split_by"]
 
 

@@ -9,6 +9,7 @@ name.
 
 import importlib
 import itertools
+import re
 import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -113,6 +114,7 @@ def parts(
     split = getattr(module, "parts", None)
     with as_input_error(str(input_path), f"logs of format {name}, and {options}"):
         found = [input_path] if split is None else split(input_path, spec)
+        found = sorted(found, key=_by_numbers)  # of a stream in the order of time
         name_of = getattr(module, "own_name", None)
         if name_of is not None:
             spec = with_log_names(input_path, found, spec, name_of)
@@ -122,6 +124,12 @@ def parts(
         if not is_text(str(path)):
             raise InputError(f"{path}: name: {path.name!a}: expected UTF-8; rename it")
     return found, spec
+
+
+def _by_numbers(path: Path) -> list:
+    """Returns the key by which log2 comes before log10."""
+    texts = re.split(r"(\d+)", str(path))
+    return [int(text) if k % 2 else text for k, text in enumerate(texts)]
 
 
 def read_recordings(

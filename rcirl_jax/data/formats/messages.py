@@ -291,6 +291,8 @@ class Drive(abc.ABC):
             source=str(spec.get("source", source)),
             licence=str(spec.get("licence", licence)),
             rate_hz=clock_rate(spec),
+            start_s=self.start,
+            origin=(float(origin[0]), float(origin[1])),
             default_speed_limit=positive(spec, "speed_limit", limit),
             notes=(*self.notes, *notes, *origin_notes(origin), *more),
             **{"tracks": tuple(tracks), **fields},

@@ -84,7 +84,7 @@ def assign_groups(
 
 def split_wholes(
     sizes: Mapping[str, int],
-    wholes: Mapping[str, str],
+    levels: tuple[Mapping[str, str], Mapping[str, str]],
     *,
     test_fraction: float,
     seed: int,
@@ -93,22 +93,22 @@ def split_wholes(
 
     Args:
       sizes: rows per group.
-      wholes: of each group the recording that it is a part of, or the group itself.
+      levels: of each group the name of the recordings, and of the groups, that stay on
+        one side with it; the first counts if there are several names.
       test_fraction: share of rows wanted in the test split.
       seed: as there.
 
     Returns:
       (group names per split; in words what is kept on one side).
     """
+    is_one = len({levels[0][group] for group in sizes}) == 1
+    wholes = levels[is_one]
     counts: dict[str, int] = {}
     for group, rows in sizes.items():
         counts[wholes[group]] = counts.get(wholes[group], 0) + rows
-    is_one = len(counts) == 1
-    chosen = assign_groups(
-        sizes if is_one else counts, test_fraction=test_fraction, seed=seed
-    )
+    chosen = assign_groups(counts, test_fraction=test_fraction, seed=seed)
     splits = {
-        split: sorted(g for g in sizes if (g if is_one else wholes[g]) in names)
+        split: sorted(group for group in sizes if wholes[group] in names)
         for split, names in chosen.items()
     }
     words = "minutes in which vehicles are first seen"

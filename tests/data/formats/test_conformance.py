@@ -99,6 +99,9 @@ def test_every_recording_is_sound(sound):
     assert recordings
     names = [recording.name for recording in recordings]
     assert len(set(names)) == len(names)
+    found, meant = recordings[0].start_s, fixture.start_s
+    assert (found is None) == (meant is None)
+    assert found is None or found == pytest.approx(meant, abs=1e-3)
     for recording in recordings:
         validate_recording(recording)
         assert recording.rate_hz == pytest.approx(fixture.rate_hz, rel=1e-6)

@@ -106,11 +106,11 @@ def test_a_vehicle_is_in_one_block_only(seed):
 
 def test_recordings_are_split_whole_and_one_by_its_groups():
     sizes = {"r1/minute-0000": 30, "r1/minute-0001": 10, "r2/minute-0000": 15}
-    wholes = {name: name[:2] for name in sizes}
-    split, words = split_wholes(sizes, wholes, test_fraction=0.25, seed=0)
+    levels = {name: name[:2] for name in sizes}, {name: name for name in sizes}
+    split, words = split_wholes(sizes, levels, test_fraction=0.25, seed=0)
     assert split["test"] == ["r2/minute-0000"]
     assert words == "recordings, or groups that a log declares"
     del sizes["r2/minute-0000"]
-    split, words = split_wholes(sizes, wholes, test_fraction=0.25, seed=0)
+    split, words = split_wholes(sizes, levels, test_fraction=0.25, seed=0)
     assert split == {"train": ["r1/minute-0000"], "test": ["r1/minute-0001"]}
     assert words == "minutes in which vehicles are first seen"

@@ -101,6 +101,7 @@ def _read_scenario(file: Path, spec: dict) -> Recording:
     table["x"], table["y"] = (values[:, :2] - origin).T.copy()
     table["speed"] = np.hypot(*values[:, 2:].T)
     tracks, track_notes = _read_tracks(file, table, spec)
+    since = float(table["timestep"].min()) * STEP_S
     # the map lies beside a scenario, named by the scenario file or its id
     stem = file.name.removeprefix(PREFIX).removesuffix(SUFFIX)
     maps = [f"log_map_archive_{key}.json" for key in (stem, name)]
@@ -114,6 +115,8 @@ def _read_scenario(file: Path, spec: dict) -> Recording:
         source=str(spec.get("source", "Argoverse 2 Motion Forecasting")),
         licence=str(spec.get("licence", "unknown")),
         rate_hz=1.0 / STEP_S,
+        start_s=float(table["start_timestamp"][0]) * 1e-9 + since,
+        origin=(float(origin[0]), float(origin[1])),
         tracks=tracks,
         lanes=lanes,
         group=group,

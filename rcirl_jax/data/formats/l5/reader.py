@@ -262,6 +262,8 @@ class _Dataset:
             source=str(spec.get("source", "L5 prediction dataset")),
             licence=str(spec.get("licence", "unknown")),
             rate_hz=rate,
+            start_s=float(frames["timestamp"][0]) * 1e-9,
+            origin=(float(origin[0]), float(origin[1])),
             tracks=tuple(tracks),
             lanes=lanes,
             signals=signals,

@@ -202,6 +202,7 @@ def _recordings(table: Table, spec: dict, stats: RowStats) -> Iterator[Recording
                     source=spec["source"],
                     licence=spec["licence"],
                     rate_hz=1.0 / frame_s,
+                    start_s=part.start if stamped else None,
                     tracks=_tracks(path, _complete(part.values), spec, survey, stamped),
                     lanes=survey.lanes(path, spec),
                     default_speed_limit=number(spec, "speed_limit"),

@@ -204,6 +204,8 @@ class _Log:
             source=str(spec.get("source", "nuPlan")),
             licence=str(spec.get("licence", "unknown")),
             rate_hz=positive(spec, "rate_hz", RATE_HZ),
+            start_s=float(self.start) * 1e-6,
+            origin=(float(origin[0]), float(origin[1])),
             tracks=tuple(tracks),
             lanes=lanes,
             signals=self._signals(poses[:, 0]),
