@@ -68,10 +68,11 @@ def _rows() -> dict[str, Row]:
     plan = jax.tree.map(lambda x: jnp.stack([x] * LANES), no_plan())
     asked, fallback = jnp.zeros(LANES), jnp.zeros(LANES, bool)
 
-    manner, config = RolloutConfig(steps=STEPS, snapshots=True).split()
+    config, (now, limits) = RolloutConfig(), rollout._begin(cases)
 
     def loop(drive: Callable, params: object) -> Row:
-        return rollout._compiled(drive, config, None), (params, cases, manner)
+        program = rollout._compiled(drive, 1, config.span, config.vehicle)
+        return program, (params, cases, config.manner(), limits, now)
 
     return {
         "sampler": (draw, (keys, scenes)),

@@ -28,7 +28,7 @@ from rcirl_jax.report.style import (
 )
 from rcirl_jax.sampling import sample
 from rcirl_jax.simulation.catalogue import family_names
-from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
+from rcirl_jax.simulation.rollout import SPAN, RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import baseline_row
 from rcirl_jax.simulation.suite import CaseRef, build, case_ref, catalogue_set
 from rcirl_jax.simulators.drive import Driver, Seen
@@ -44,7 +44,7 @@ def planner(path: Path, weights: str) -> None:
     """One planning step in four panels, at the step where the filter refuses most."""
     (row, *_), reward = table_rows([weights], []), open_reward(weights)
     cases = build([case_ref(PLANNED_CASE)], PLANNED_S)
-    config = RolloutConfig(steps=round(10 * PLANNED_S), scenes=True)
+    config = RolloutConfig(steps=round(10 * PLANNED_S), frames_every=SPAN)
     *_, frames = drive_cases(row.policy, row.params, cases, config)
     frames = jax.tree.map(lambda x: x[0], frames)
 

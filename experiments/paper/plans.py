@@ -163,11 +163,11 @@ def frames(
     Returns:
       At most `count` scenes, evenly spread, and the number of the case of each.
     """
-    config = RolloutConfig(steps=round(duration_s / STEP_S), scenes=True)
-    record, _, scenes = drive_cases(policy, params, cases, config)
     every = round(every_s / STEP_S)
+    config = RolloutConfig(steps=round(duration_s / STEP_S), frames_every=every)
+    record, _, scenes = drive_cases(policy, params, cases, config)
     valid = np.asarray(record.valid)[:, ::every]
-    met = jax.tree.map(lambda x: np.asarray(x)[:, ::every][valid], scenes)
+    met = jax.tree.map(lambda x: x[valid], scenes)
     return spread_over(count, met, np.nonzero(valid)[0])
 
 

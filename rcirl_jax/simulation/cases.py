@@ -28,6 +28,7 @@ NUM_PHASES = 8  # P
 NUM_MOVES = 2  # M
 NUM_HISTORY = 4  # H: latencies of 0 to 0.3 s
 NUM_DELAY = 9  # D: reaction delays of 0 to 0.8 s
+NUM_REPLAY = 81  # moments of a recorded drive, 0 to 8 s
 
 _T = TypeVar("_T")
 
@@ -147,7 +148,10 @@ def perfect_perception() -> Perception:
 
 
 class Replay(flax.struct.PyTreeNode, kw_only=True):
-    """Recorded motion of the agents and of the human ego on the step grid."""
+    """Recorded motion of the agents and of the human ego on the step grid.
+
+    In a case of the catalogue nobody is present in it (`nobody_recorded`).
+    """
 
     s: jax.Array  # [A, S + 1] m, recorded station of the centre
     l: jax.Array  # [A, S + 1] m
@@ -162,6 +166,19 @@ class Replay(flax.struct.PyTreeNode, kw_only=True):
     turns_reactive: jax.Array  # []
 
 
+def nobody_recorded() -> Replay:
+    """A replay without anybody in it: the others act by themselves; numpy leaves."""
+    agents = np.zeros((NUM_AGENTS, NUM_REPLAY), np.float32)
+    ego = np.zeros(NUM_REPLAY, np.float32)
+    return node(
+        Replay,
+        **dict.fromkeys(("s", "l", "heading", "v"), agents),
+        present=agents > 0.0,
+        **dict.fromkeys(("ego_s", "ego_l", "ego_v"), ego),
+        turns_reactive=np.bool_(True),
+    )
+
+
 class Case(flax.struct.PyTreeNode, kw_only=True):
     """One simulated drive."""
 
@@ -174,7 +191,7 @@ class Case(flax.struct.PyTreeNode, kw_only=True):
     lines: Lines
     agents: Agents
     perception: Perception
-    replay: Replay | None = None
+    replay: Replay | None = None  # None: as `nobody_recorded`
     ego_a: jax.Array | None = None  # [] m/s^2 at t = 0; None: 0
 
 

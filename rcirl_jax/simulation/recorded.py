@@ -26,6 +26,7 @@ from rcirl_jax.simulation.cases import (
     FLAGS,
     NUM_AGENTS,
     NUM_LINES,
+    NUM_REPLAY,
     NUM_ROAD,
     ROAD_STEP_M,
     STEP_S,
@@ -41,7 +42,7 @@ from rcirl_jax.simulation.cases import (
     perfect_perception,
 )
 from rcirl_jax.types import Demonstration, Kind
-from rcirl_jax.units import DT_S, HORIZON_S, NUM_STATIONS, STATION_STEP_M, TIMES_S
+from rcirl_jax.units import DT_S, NUM_STATIONS, STATION_STEP_M, TIMES_S
 
 # median drivers of the IDM population: T s, s0 m, a and b m/s^2, reaction s
 MEDIAN = {"headway": 1.4, "standstill": 2.0, "acceleration": 1.4, "braking": 2.0}
@@ -84,7 +85,7 @@ def _agents(tables: dict, limit: np.ndarray) -> Agents:
     return agents_of(rows)
 
 
-STEPS = round(HORIZON_S / STEP_S)  # of a case; one with a shorter record is padded
+STEPS = NUM_REPLAY - 1  # of a case; one with a shorter record is padded
 CLOCK_S = np.arange(STEPS + 1) * STEP_S  # [STEPS + 1] s
 DATASET = 2**40  # apart are the numbers of two datasets
 LONG_S = 1000.0  # s, a light that does not change within the case

@@ -2,8 +2,12 @@
 
 The only file of the simulator that names `jit`, `vmap` or `scan` over cases and time.
 A policy is a pure function `(params, scene, key, before) -> Plan`, `before` being the
-plan in force; between two plans the ego follows the plan. Weights and the manner of
-driving are arguments: the compiled program serves every row of one policy and shape.
+plan in force; between two plans the ego follows the plan.
+
+What is compiled is a span of half a second for a group of cases. Longer drives are the
+same program called again, so that one serves the suite, held-out drives, demonstrations
+and pictures, whatever they last and whoever takes turns. Weights and the manner of
+driving are arguments, and cases of the catalogue have a replay without anybody in it.
 
 What is scanned is the step of all cases side by side: a scan under `vmap` would be
 traced once for one case and again for many.
@@ -14,7 +18,7 @@ import dataclasses
 import functools
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import flax.struct
@@ -23,16 +27,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.planner.plan import (
-    Plan,
-    command,
-    either,
-    later,
-    no_plan,
-    stations_from_now,
-)
+from rcirl_jax.planner.plan import Plan, command, later, no_plan, stations_from_now
 from rcirl_jax.simulation.agents import colours
-from rcirl_jax.simulation.cases import STEP_S, Case, Record, Snapshot, World
+from rcirl_jax.simulation.cases import (
+    STEP_S,
+    Case,
+    Record,
+    Snapshot,
+    World,
+    nobody_recorded,
+)
 from rcirl_jax.simulation.world import Vehicle, observe, road_limit, start, step
 from rcirl_jax.types import Scene
 
@@ -42,11 +46,12 @@ Logs = Any  # what a rollout returns: records, or what `reduce` made of them
 
 SAMPLER_STREAM = 7  # fold_in number of the sampler's key
 MAX_DELAY = 10  # steps by which commands may be late
+SPAN = 5  # steps of one call, at least
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RolloutConfig:
-    """The settings of a rollout; hashable. Its manner is data, the rest is static."""
+    """The settings of a rollout; hashable."""
 
     # steps between two plans: 1 plans at 10 Hz
     plan_every: int = 1
@@ -60,10 +65,8 @@ class RolloutConfig:
     braking_jerk: float | None = None
     # steps that the policy, then the takeover policy drive in turn (where there is one)
     takeover_schedule: tuple[int, int] = (80, 140)
-    # keep the agents and plans for pictures
-    snapshots: bool = False
-    # keep the planning frames, one per plan
-    scenes: bool = False
+    # steps between two planning frames that are kept; 0: none
+    frames_every: int = 0
     vehicle: Vehicle = dataclasses.field(default_factory=Vehicle)
 
     def __post_init__(self) -> None:
@@ -81,92 +84,157 @@ class RolloutConfig:
             raise InputError(
                 f"command_delay: {self.command_delay}: expected 0 to {MAX_DELAY} steps"
             )
+        for name in ("takeover_schedule", "frames_every"):
+            given = getattr(self, name)
+            if np.any(np.mod(given, self.span)):
+                raise InputError(
+                    f"{name}: {given}: expected multiples of {self.span} steps"
+                )
 
-    def split(self) -> tuple["Manner", "RolloutConfig"]:
-        """The manner, and the configuration that all manners share."""
+    @property
+    def span(self) -> int:
+        """The steps of one call: `SPAN`, or the next multiple of `plan_every`."""
+        return -(-SPAN // self.plan_every) * self.plan_every
+
+    def manner(self) -> "Manner":
+        """The part of the settings that is data."""
         # a command held for a step moves the acceleration by this share of its way
         share = 1.0 - math.exp(-STEP_S / self.vehicle.acceleration_lag)
         jerk = math.inf if self.braking_jerk is None else self.braking_jerk
-        manner = Manner(
+        return Manner(
             follow_log=jnp.asarray(self.follow_log),
             command_delay=jnp.asarray(self.command_delay),
             below=jnp.asarray(jerk * STEP_S / share, jnp.float32),
         )
-        usual = {"follow_log": False, "command_delay": 0, "braking_jerk": None}
-        return manner, dataclasses.replace(self, **usual)
 
 
 class Manner(flax.struct.PyTreeNode, kw_only=True):
-    """The part of a `RolloutConfig` that is data; all []."""
+    """How the ego follows its commands; all []."""
 
     follow_log: jax.Array  # bool
     command_delay: jax.Array  # steps
     below: jax.Array  # m/s^2 by which a command may be below the acceleration
 
 
-def rollout(
-    policy: Policy,
-    params: Params,
-    cases: Case,
-    config: RolloutConfig,
-    manner: Manner,
-    takeover_policy: Policy | None = None,
-) -> tuple[jax.Array, Scene | None]:
-    """Drive cases [B] from start to end, side by side.
+class Now(flax.struct.PyTreeNode, kw_only=True):
+    """What one span hands to the next."""
 
-    With a `takeover_policy` the two drive in turn, the policy for
-    `takeover_schedule[0]` steps, then the other for `takeover_schedule[1]`; `params` is
-    then the pair of their weights.
+    worlds: World  # leaves [B, ...]
+    waiting: jax.Array  # [B, MAX_DELAY + 1] m/s^2, commands, newest first
+    plan: Plan  # in force, leaves [B, ...]
 
-    Returns:
-      Record and, where the configuration asks for it, snapshot of every step as
-      `_unpacked` reads them [S, B, L], and the planning frames [S / plan_every, B]
-      where it asks for those; time comes first.
-    """
-    limits = jax.vmap(lambda case: road_limit(case.road))(cases)
-    stream = lambda seed: jax.random.fold_in(jax.random.key(seed), SAMPLER_STREAM)  # noqa: E731
-    keys = jax.vmap(stream)(cases.seed)
 
-    def plan_of(scene: Scene, key: jax.Array, now: World, before: Plan) -> Plan:
-        with jax.named_scope("policy"):
-            draw = jax.random.fold_in(key, now.step)
-            if takeover_policy is None:
-                return policy(params, scene, draw, before)
-            plan = policy(params[0], scene, draw, before)
-            other = takeover_policy(params[1], scene, draw, before)
-            first, second = config.takeover_schedule
-            taken_over = now.step % (first + second) >= first
-            return either(taken_over, other, plan)
+@jax.jit
+def _begin(cases: Case) -> tuple[Now, jax.Array]:
+    """The start of cases [B], and the speed limits [B, R] m/s that the planner gets."""
+    count = cases.steps.shape[0]
+    now = Now(
+        worlds=jax.vmap(start)(cases),
+        waiting=jnp.zeros((count, MAX_DELAY + 1)),
+        plan=jax.tree.map(lambda x: jnp.stack([x] * count), no_plan()),
+    )
+    # numbers of Python are of a weaker type, and would compile the first span alone
+    now = jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), now)
+    return now, jax.vmap(lambda case: road_limit(case.road))(cases)
+
+
+@jax.jit
+def _seen(cases: Case, worlds: World, limits: jax.Array) -> Scene:
+    """The planning frames [B] of worlds [B]."""
+    return jax.vmap(observe)(cases, worlds, limits)
+
+
+@functools.lru_cache(maxsize=32)
+def _compiled(policy: Policy, plan_every: int, length: int, vehicle: Vehicle) -> Any:  # noqa: ANN401
+    """The program of a span of `length` steps."""
 
     def tick(
-        case: Case, now: World, waiting: jax.Array, plan: Plan
-    ) -> tuple[tuple[World, jax.Array, Plan], jax.Array]:
-        waiting = jnp.append(command(plan, now.ego.v), waiting[:-1])
+        case: Case, manner: Manner, now: Now
+    ) -> tuple[Now, tuple[Record, Snapshot]]:
+        world, plan = now.worlds, now.plan
+        waiting = jnp.append(command(plan, world.ego.v), now.waiting[:-1])
         late = waiting[manner.command_delay]
-        applied = jnp.maximum(late, now.ego.a - manner.below)
+        applied = jnp.maximum(late, world.ego.a - manner.below)
         after, record = step(
-            case, now, applied, plan.fallback, config.vehicle, manner.follow_log
+            case, world, applied, plan.fallback, vehicle, manner.follow_log
         )
-        shot = _snapshot(case, now, after, plan) if config.snapshots else None
-        return (after, waiting, later(plan, STEP_S)), _packed((record, shot))
+        shot = _snapshot(case, world, after, plan)
+        plan = later(plan, STEP_S)
+        return Now(worlds=after, waiting=waiting, plan=plan), _packed((record, shot))
 
-    def plan_and_drive(carry: tuple, _: None) -> tuple[tuple, tuple]:
-        worlds, waiting, before = carry
-        scenes = jax.vmap(observe)(cases, worlds, limits)
-        plans = jax.vmap(plan_of)(scenes, keys, worlds, before)
-        carry, logs = jax.lax.scan(
-            lambda now, _: jax.vmap(tick)(cases, *now),
-            (worlds, waiting, plans),
-            length=config.plan_every,
-        )
-        return carry, (logs, scenes if config.scenes else None)
+    def run(
+        params: Params, cases: Case, manner: Manner, limits: jax.Array, now: Now
+    ) -> tuple[Now, jax.Array]:
+        stream = lambda seed: jax.random.fold_in(jax.random.key(seed), SAMPLER_STREAM)  # noqa: E731
+        keys = jax.vmap(stream)(cases.seed)
 
-    count = cases.steps.shape[0]
-    nothing = jax.tree.map(lambda x: jnp.stack([x] * count), no_plan())
-    begin = (jax.vmap(start)(cases), jnp.zeros((count, MAX_DELAY + 1)), nothing)
-    plans = config.steps // config.plan_every
-    _, (logs, scenes) = jax.lax.scan(plan_and_drive, begin, length=plans)
-    return logs.reshape(config.steps, count, -1), scenes
+        def plan_of(scene: Scene, key: jax.Array, world: World, before: Plan) -> Plan:
+            with jax.named_scope("policy"):
+                return policy(
+                    params, scene, jax.random.fold_in(key, world.step), before
+                )
+
+        def plan_and_drive(now: Now, _: None) -> tuple[Now, jax.Array]:
+            scenes = jax.vmap(observe)(cases, now.worlds, limits)
+            now = now.replace(
+                plan=jax.vmap(plan_of)(scenes, keys, now.worlds, now.plan)
+            )
+            drive = jax.vmap(tick, in_axes=(0, None, 0))
+            return jax.lax.scan(
+                lambda now, _: drive(cases, manner, now), now, length=plan_every
+            )
+
+        now, logs = jax.lax.scan(plan_and_drive, now, length=length // plan_every)
+        return now, logs.reshape(length, *logs.shape[2:])
+
+    return jax.jit(run)
+
+
+def rollout(
+    drivers: Sequence[tuple[Policy, Params]],
+    cases: Case,
+    config: RolloutConfig,
+) -> tuple[list[jax.Array], list[Scene]]:
+    """Drive cases [B] from start to end, side by side.
+
+    Two drivers drive in turn, the first for `takeover_schedule[0]` steps, then the
+    other for `takeover_schedule[1]`.
+
+    Args:
+      drivers: who drives: one, or two in turn; policies with their weights.
+      cases: leaves [B, ...].
+      config: of the rollout.
+
+    Returns:
+      Record and snapshot of every step, as `_unpacked` reads them, in spans
+      [span, B, L], which may end after the run, and the planning frames [B] that the
+      configuration asks for.
+    """
+    count, length = cases.steps.shape[0], config.span
+    filled = jax.tree.map(
+        lambda x: np.broadcast_to(x, (count, *x.shape)), nobody_recorded()
+    )
+    cases = cases.replace(
+        replay=cases.replay or filled,
+        ego_a=np.zeros(count, np.float32) if cases.ego_a is None else cases.ego_a,
+    )
+    cases = jax.tree.map(jnp.asarray, cases)
+    programs = [
+        (_compiled(policy, config.plan_every, length, config.vehicle), params)
+        for policy, params in drivers
+    ]
+    manner = config.manner()
+    now, limits = _begin(cases)
+    logs, frames = [], []
+    first, second = config.takeover_schedule
+    for at in range(0, config.steps, length):
+        if config.frames_every and at % config.frames_every == 0:
+            frames.append(_seen(cases, now.worlds, limits))
+        others = len(programs) > 1 and at % (first + second) >= first
+        program, params = programs[int(others)]
+        now, made = program(params, cases, manner, limits, now)
+        logs.append(made)
+    return logs, frames
 
 
 def _snapshot(case: Case, now: World, after: World, plan: Plan) -> Snapshot:
@@ -180,17 +248,17 @@ def _snapshot(case: Case, now: World, after: World, plan: Plan) -> Snapshot:
     )
 
 
-def _packed(logs: tuple[Record, Snapshot | None]) -> jax.Array:
+def _packed(logs: tuple[Record, Snapshot]) -> jax.Array:
     """The logs of a step as one array [L]: a loop writes it at once."""
     leaves = [jnp.ravel(x).astype(jnp.float32) for x in jax.tree.leaves(logs)]
     return jnp.concatenate(leaves)
 
 
-def _unpacked(packed: Any, cases: Case, snapshots: bool) -> tuple:  # noqa: ANN401
+def _unpacked(packed: Any, cases: Case) -> tuple[Record, Snapshot]:  # noqa: ANN401
     """Records and snapshots [...] of packed ones [..., L]; numpy's or JAX's."""
     given, case = jax.tree.flatten(cases)
     kinds = tuple(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in given)
-    leaves, tree = _layout(case, kinds, snapshots)
+    leaves, tree = _layout(case, kinds)
     ends = np.cumsum([leaf.size for leaf in leaves])
     parts = [
         packed[..., end - leaf.size : end]
@@ -202,34 +270,23 @@ def _unpacked(packed: Any, cases: Case, snapshots: bool) -> tuple:  # noqa: ANN4
 
 
 @functools.lru_cache(maxsize=8)
-def _layout(case: Any, kinds: tuple, snapshots: bool) -> tuple[list, Any]:  # noqa: ANN401
+def _layout(case: Any, kinds: tuple) -> tuple[list, Any]:  # noqa: ANN401
     """Returns what `_packed` packs of a case of such leaves: leaves, their tree."""
 
-    def logged(case: Case) -> tuple[Record, Snapshot | None]:
+    def logged(case: Case) -> tuple[Record, Snapshot]:
         world = start(case)
         after, record = step(case, world, case.ego_v, case.ego_v > 0.0, Vehicle())
-        shot = _snapshot(case, world, after, no_plan()) if snapshots else None
-        return record, shot
+        return record, _snapshot(case, world, after, no_plan())
 
     return jax.tree.flatten(jax.eval_shape(logged, jax.tree.unflatten(case, kinds)))
 
 
-@functools.lru_cache(maxsize=32)
-def _compiled(
-    policy: Policy, config: RolloutConfig, takeover_policy: Policy | None
-) -> Callable:
-    def run(params: Params, cases: Case, manner: Manner) -> Logs:
-        return rollout(policy, params, cases, config, manner, takeover_policy)
-
-    return jax.jit(run)
-
-
 @functools.lru_cache(maxsize=8)
-def _reducer(reduce: Callable[[Record], Logs], snapshots: bool) -> Callable:
+def _reducer(reduce: Callable[[Record], Logs], steps: int) -> Callable:
     """A program of its own: whoever drove, records are judged by the same."""
 
-    def judge(packed: jax.Array, cases: Case) -> Logs:
-        record, _ = _unpacked(packed, cases, snapshots)
+    def judge(spans: list[jax.Array], cases: Case) -> Logs:
+        record, _ = _unpacked(jnp.concatenate(spans)[:steps], cases)
         return jax.vmap(reduce, in_axes=1)(record)
 
     return jax.jit(judge)
@@ -247,47 +304,45 @@ def drive_cases(
     cases: Case,
     config: RolloutConfig,
     reduce: Callable[[Record], Logs] | None = None,
-    takeover_policy: Policy | None = None,
     *,
+    takeover: tuple[Policy, Params] | None = None,
     keep: bool = False,
 ) -> Logs:
-    """All cases [B]: (records, snapshots, scenes), or what `reduce` makes of them.
+    """All cases [B]: (records, snapshots, frames), or what `reduce` makes of them.
 
     On a CPU a batch that is a multiple of `LANES` runs in groups of that many, else
-    all cases at once. With `reduce` the records never leave the device, and on a CPU
-    there are snapshots too: so one program serves the suite and the pictures of its
-    cases, and plots the same rollouts.
+    all cases at once. With `reduce` the records never leave the device.
 
     Args:
       policy: who drives.
-      params: its weights; with a takeover policy the pair of both.
+      params: its weights.
       cases: leaves [B, ...].
       config: of the rollouts.
       reduce: record [S] -> what is wanted of it.
-      takeover_policy: drives in turn with the policy.
-      keep: with `reduce` (what it makes, logs with snapshots) instead.
+      takeover: policy and weights that drive in turn with the first.
+      keep: with `reduce` (what it makes, logs) instead.
 
     Returns:
-      Leaves [B, ...]; records and snapshots [B, S, ...], as numpy arrays.
+      Leaves [B, ...] as numpy arrays: records and snapshots [B, S, ...], planning
+      frames [B, S / frames_every, ...] or None.
     """
     total = cases.steps.shape[0]
     in_groups = total % LANES == 0 and jax.default_backend() == "cpu"
-    if reduce is not None and (keep or in_groups):
-        config = dataclasses.replace(config, snapshots=True)
-    manner, config = config.split()
-    drive = _compiled(policy, config, takeover_policy)
+    drivers = [(policy, params), *([takeover] if takeover else [])]
 
     def group(first: int) -> Logs:
         lanes = slice(first, first + (LANES if in_groups else total))
         part = jax.tree.map(lambda leaf: leaf[lanes], cases)
-        logs = jax.block_until_ready(drive(params, part, manner))
-        made = reduce and _reducer(reduce, config.snapshots)(logs[0], part)
+        spans, frames = jax.block_until_ready(rollout(drivers, part, config))
+        made = reduce and _reducer(reduce, config.steps)(spans, part)
         if reduce and not keep:
             return jax.block_until_ready(made)
-        # time comes first in the program: a view, where a program would copy
-        by_case = lambda x: np.swapaxes(np.asarray(x), 0, 1)  # noqa: E731
-        packed, scenes = jax.tree.map(by_case, logs)
-        kept = *_unpacked(packed, part, config.snapshots), scenes
+        packed = np.concatenate([np.asarray(x) for x in spans])[: config.steps]
+        kept = (
+            # time comes first: a view
+            *_unpacked(np.swapaxes(packed, 0, 1), part),
+            jax.tree.map(lambda *x: np.stack(x, axis=1), *frames) if frames else None,
+        )
         return (made, kept) if keep else kept
 
     if not in_groups:

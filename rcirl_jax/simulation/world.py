@@ -74,6 +74,7 @@ from rcirl_jax.simulation.cases import (
     Road,
     Seen,
     World,
+    nobody_recorded,
 )
 from rcirl_jax.types import NUM_TAGS, Ego, Kind, Path, Scene
 from rcirl_jax.units import NUM_STATIONS, NUM_TIMES
@@ -452,8 +453,9 @@ def start(case: Case) -> World:
     )
     step = jnp.zeros((), jnp.int32)
     state = spawn_and_despawn(case, ego, state, step)
-    if case.replay is not None:
-        state = _from_log(case, case.replay, state, step)
+    replay = _replay(case)
+    reactive = ~jnp.any(replay.present)
+    state = either(reactive, state, _from_log(case, replay, state, step))
     return World(
         step=step,
         ego=ego,
@@ -462,8 +464,12 @@ def start(case: Case) -> World:
         served=jnp.zeros((NUM_LINES,), bool),
         halts=jnp.zeros((NUM_LINES,), bool),
         stopped=jnp.zeros((), bool),
-        reactive=jnp.zeros((), bool),
+        reactive=reactive,
     )
+
+
+def _replay(case: Case) -> Replay:
+    return jax.tree.map(jnp.asarray, case.replay or nobody_recorded())
 
 
 def _from_log(
@@ -510,16 +516,13 @@ def _advance_agents(case: Case, world: World) -> tuple[AgentState, jax.Array]:
     return moved, jnp.maximum(induced, 0.0)
 
 
-def _turns_reactive(
-    case: Case, replay: Replay, world: World, ttc: jax.Array
-) -> jax.Array:
+def _turns_reactive(replay: Replay, world: World, ttc: jax.Array) -> jax.Array:
     """True if the ego has left its log, or a conflict is near."""
     index = jnp.minimum(world.step, replay.ego_s.shape[0] - 1)
     departed = jnp.hypot(
         world.ego.s - replay.ego_s[index], world.ego.l - replay.ego_l[index]
     )
-    turns = (departed > DEPARTURE_M) | (ttc < CONFLICT_S)
-    return world.reactive | (replay.turns_reactive & turns)
+    return replay.turns_reactive & ((departed > DEPARTURE_M) | (ttc < CONFLICT_S))
 
 
 def step(
@@ -543,16 +546,14 @@ def step(
     Returns:
       The world one step later and the record of that later moment.
     """
-    ego = world.ego
+    ego, replay = world.ego, _replay(case)
     moved_ego = drive(ego, case.road, acceleration, vehicle)
-    if case.replay is not None:
-        human = _human(case.replay, ego, world.step + 1)
-        moved_ego = either(follow_log, human, moved_ego)
+    human = _human(replay, ego, world.step + 1)
+    moved_ego = either(follow_log, human, moved_ego)
     state, induced = _advance_agents(case, world)
-    if case.replay is not None:
-        logged = _from_log(case, case.replay, world.agents, world.step + 1)
-        state = either(world.reactive, state, logged)
-        induced = jnp.where(world.reactive, induced, 0.0)
+    logged = _from_log(case, replay, world.agents, world.step + 1)
+    state = either(world.reactive, state, logged)
+    induced = jnp.where(world.reactive, induced, 0.0)
     # what has ended stays as it is
     over = world.stopped
     moved_ego = either(over, ego, moved_ego)
@@ -570,14 +571,10 @@ def step(
     state = state.replace(
         present=state.present & ~found.hit, gone=state.gone | found.hit
     )
-    if case.replay is None:
-        state = spawn_and_despawn(case, moved_ego, state, world.step + 1)
-    reactive = world.reactive
-    if case.replay is not None:
-        ttc = jnp.min(jnp.where(found.ahead, found.ttc, jnp.inf))
-        reactive = _turns_reactive(case, case.replay, world, ttc) & ~jnp.asarray(
-            follow_log
-        )
+    # of who was recorded nobody appears by a script; who is far away leaves
+    state = spawn_and_despawn(case, moved_ego, state, world.step + 1)
+    ttc = jnp.min(jnp.where(found.ahead, found.ttc, jnp.inf))
+    turns = _turns_reactive(replay, world, ttc) & ~jnp.asarray(follow_log)
     return World(
         step=world.step + 1,
         ego=moved_ego,
@@ -586,7 +583,7 @@ def step(
         served=served,
         halts=halts,
         stopped=over | crash,
-        reactive=reactive,
+        reactive=world.reactive | turns,
     ), record
 
 

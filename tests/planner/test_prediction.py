@@ -16,7 +16,7 @@ from rcirl_jax.planner.prediction import (
     with_predicted_futures,
 )
 from rcirl_jax.simulation.recorded import case_of
-from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
+from rcirl_jax.simulation.rollout import SPAN, RolloutConfig, drive_cases
 from rcirl_jax.types import Kind
 from rcirl_jax.units import DT_S, TIMES_S
 from tests.helpers.scenes import random_scene, scene
@@ -169,9 +169,9 @@ def test_one_scene_through_both_doors():
     case = case_of(jax.tree.map(lambda x: np.asarray(x)[0], made))
     cases = jax.tree.map(lambda x: np.asarray(x)[None], case)
     human = lambda params, scene, key, before: held(scene.ego.v, 0.0 * scene.ego.v)  # noqa: E731
-    config = RolloutConfig(steps=steps + 10, follow_log=True, scenes=True)
+    config = RolloutConfig(steps=steps + 10, follow_log=True, frames_every=SPAN)
     _, _, scenes = drive_cases(human, None, cases, config)
-    online = jax.tree.map(lambda x: np.asarray(x)[0, steps], scenes)
+    online = jax.tree.map(lambda x: x[0, steps // SPAN], scenes)
 
     np.testing.assert_array_equal(offline.time_valid, online.time_valid)
     np.testing.assert_array_equal(offline.obstacles.valid, online.obstacles.valid)

@@ -19,7 +19,7 @@ def stack(cases):
 
 def drive(cases, steps=300, policy=constant, params=0.0, **config):
     """(record, snapshot) with numpy leaves [B, S, ...]."""
-    config = RolloutConfig(steps=steps, snapshots=True, **config)
+    config = RolloutConfig(steps=steps, **config)
     params = jnp.asarray(params) if isinstance(params, float) else params
     record, shot, _ = drive_cases(policy, params, stack(cases), config)
     return jax.tree.map(np.asarray, record), jax.tree.map(np.asarray, shot)

@@ -35,7 +35,7 @@ def coast(params, scene, key, before):
 
 def test_the_human_drives_its_own_log_and_the_planner_sees_the_stored_scene():
     drives = held_out([Rows(stored())], 6)
-    config = RolloutConfig(steps=STEPS, follow_log=True, scenes=True)
+    config = RolloutConfig(steps=STEPS, follow_log=True, frames_every=STEPS)
     record, _, scenes = drive_cases(coast, None, drives.cases, config)
     assert not np.any(np.asarray(record.collision))
     for i, steps in enumerate(np.asarray(drives.cases.steps)):

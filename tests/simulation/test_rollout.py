@@ -14,7 +14,7 @@ from rcirl_jax.planner.rank import RankConfig, ranking
 from rcirl_jax.runtime.compiling import compiles
 from rcirl_jax.simulation.cases import NUM_AGENTS, STEP_S, Replay
 from rcirl_jax.simulation.metrics import MetricsConfig, case_metrics
-from rcirl_jax.simulation.rollout import LANES, RolloutConfig, drive_cases
+from rcirl_jax.simulation.rollout import LANES, SPAN, RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import (
     BASELINES,
     baseline_row,
@@ -141,7 +141,7 @@ def seen_by_planner(**perception):
     """What the planner sees of one car ahead: its rear in every step."""
     car = {"s": 40.0, "v": 10.0, "phases": [(0.0, 14.0, 4.0)]}
     case = make_case([car], speed=10.0, seed=perception.pop("seed", 1), **perception)
-    config = RolloutConfig(steps=60, scenes=True)
+    config = RolloutConfig(steps=60 * SPAN, frames_every=SPAN)
     _, _, scenes = drive_cases(constant, jnp.zeros(()), stack([case]), config)
     obstacles = jax.tree.map(np.asarray, scenes.obstacles)
     return obstacles.s_lower[0, :, 0, 0], obstacles.valid[0, :, 0, 0]
@@ -211,10 +211,10 @@ def test_policy_and_takeover_policy_take_turns():
 
     record, *_ = drive_cases(
         constant,
-        (jnp.float32(-1.0), jnp.float32(1.0)),
+        jnp.float32(-1.0),
         stack([make_case(speed=20.0)]),
         config,
-        takeover_policy=constant,
+        takeover=(constant, jnp.float32(1.0)),
     )
     command = np.asarray(record.command)[0]
     expected = np.where(np.arange(100) % 50 < 30, -1.0, 1.0)
