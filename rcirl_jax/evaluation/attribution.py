@@ -13,7 +13,13 @@ Source: Sundararajan, Taly and Yan, Axiomatic Attribution for Deep Networks
 import jax
 import jax.numpy as jnp
 
-from rcirl_jax.reward import Normaliser, RewardParams, effective_model, normalise
+from rcirl_jax.reward import (
+    Normaliser,
+    RewardParams,
+    effective_model,
+    identity_normaliser,
+    normalise,
+)
 from rcirl_jax.reward.network import scene_values
 
 STEPS = 64  # points on the line from b to a
@@ -59,9 +65,7 @@ def attribute(
     # exactly 0 where the network sees no difference
     change = (clipped_a - clipped_b) / normaliser.scale
     model = effective_model(params, activation)
-    # x is normalised already
-    ones, bound = jnp.ones(start.shape[1]), jnp.full(start.shape[1], jnp.inf)
-    as_is = Normaliser(lower=-bound, upper=bound, location=0.0 * ones, scale=ones)
+    as_is = identity_normaliser(start.shape[1])  # x is normalised already
 
     def total(x: jax.Array) -> jax.Array:
         rows = x.T[:, :, None]

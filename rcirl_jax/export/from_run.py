@@ -23,7 +23,7 @@ from rcirl_jax.reward import (
 from rcirl_jax.reward.network import LEAKY_SLOPE, layers_of
 from rcirl_jax.runtime.atomic_files import read_json
 from rcirl_jax.runtime.checked import typed_settings
-from rcirl_jax.train.featurise import featurised, host_batch, normaliser_rows
+from rcirl_jax.train.featurise import in_chunks, normaliser_rows
 from rcirl_jax.train.loop import restore_run
 from rcirl_jax.train.metrics import read_metrics
 from rcirl_jax.train.state import TrainConfig
@@ -193,12 +193,12 @@ def verification_samples(
     """Return [m, T, F] features and [m, T] masks: half humans, half candidates."""
     count = min(NUM_SAMPLES // 2, dataset.indices("train").size)
     index = dataset.indices("train")[:count]
-    batch = jax.device_put(host_batch(dataset.read(index), np.ones(count), index))
     key = jax.random.key(config.seed)
-    made = featurised(key, batch, config)
-    human, candidates = np.asarray(made.human), np.asarray(made.points)
+    parts = in_chunks(key, dataset.read(index), index, config)
+    made = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    human, candidates = made.human, made.points
     picked = candidates[np.arange(count), np.arange(count) % candidates.shape[1]]
-    valid = np.asarray(made.time_valid)
+    valid = made.time_valid
     return np.concatenate([human, picked]), np.concatenate([valid, valid])
 
 

@@ -26,7 +26,12 @@ from rcirl_jax.reward.network import (
     init_params,
     value,
 )
-from rcirl_jax.reward.normaliser import fit_normaliser, normalise, seen_range
+from rcirl_jax.reward.normaliser import (
+    fit_normaliser,
+    identity_normaliser,
+    normalise,
+    seen_range,
+)
 from rcirl_jax.reward.speed_dp import SPEED_DP_ROW, SpeedDpCost, speed_dp_cost
 from rcirl_jax.types import CandidateInfo, Normaliser, RewardParams
 
@@ -49,6 +54,7 @@ __all__ = [
     "effective_model",
     "effective_params",
     "fit_normaliser",
+    "identity_normaliser",
     "init_params",
     "lattice_cost",
     "lattice_costs",

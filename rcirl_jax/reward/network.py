@@ -30,6 +30,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.reward.normaliser import identity_normaliser
 from rcirl_jax.types import Normaliser, RewardParams
 from rcirl_jax.units import NUM_TIMES
 
@@ -348,8 +349,7 @@ def init_params(
         )
     if config.module:
         _check_module(config.module, num_features)
-    ones = jnp.ones((num_features,))
-    normaliser = Normaliser(lower=ones, upper=ones, location=ones, scale=ones)
+    normaliser = identity_normaliser(num_features)
     x, valid = jnp.zeros((num_features, NUM_TIMES, 1)), jnp.ones((NUM_TIMES,), bool)
     return dict(RewardModel(config).init(key, normaliser, valid, x)["params"])
 

@@ -53,6 +53,14 @@ def fit_normaliser(features: np.ndarray, feature_map: FeatureMap) -> Normaliser:
     )
 
 
+def identity_normaliser(size: int) -> Normaliser:
+    """Makes a normaliser that leaves `size` features as they are."""
+    zeros = jnp.zeros(size)
+    return Normaliser(
+        lower=zeros - jnp.inf, upper=zeros + jnp.inf, location=zeros, scale=zeros + 1.0
+    )
+
+
 def varies(rows: np.ndarray, middle: np.ndarray) -> np.ndarray:
     """Returns the features [F] that vary in `VARYING_SHARE` of rows [n, F]."""
     # float32 is what the features are made in

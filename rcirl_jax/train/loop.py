@@ -16,7 +16,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 
@@ -25,7 +24,7 @@ from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.data.store.rows import scene_name, unusable_leaves
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
-from rcirl_jax.reward import Normaliser, effective_params, fit_normaliser
+from rcirl_jax.reward import effective_params, fit_normaliser, identity_normaliser
 from rcirl_jax.runtime.atomic_files import read_json, write_whole
 from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.runtime.signals import Interrupted, asked
@@ -285,10 +284,8 @@ def restore_run(workdir: Path, config: TrainConfig) -> TrainState:
 
 def blank_state(config: TrainConfig) -> TrainState:
     """Returns a state of a run's structure, to restore a checkpoint into."""
-    ones = jnp.ones(feature_map(config.features).num_features)
-    return init_state(
-        config, Normaliser(lower=ones, upper=ones, location=ones, scale=ones)
-    )
+    size = feature_map(config.features).num_features
+    return init_state(config, identity_normaliser(size))
 
 
 def refuse_step(

@@ -16,6 +16,8 @@ import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import jax
+
 from rcirl_jax.data.formats.files import listing
 from rcirl_jax.data.importing import Logs, import_logs
 from rcirl_jax.data.inputs import input_files
@@ -26,11 +28,15 @@ from rcirl_jax.data.store.dataset import (
     open_dataset,
 )
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.closed_loop import incumbent_score, table_rows
-from rcirl_jax.planner.rank import Params, Policy, RankConfig, rank_policy
+from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.features import feature_map
+from rcirl_jax.planner.rank import Params, Policy, RankConfig
+from rcirl_jax.reward import effective_params, identity_normaliser, init_params
 from rcirl_jax.runtime.pipeline import digest, file_sha256
 from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
+from rcirl_jax.simulation.rows import baseline_row
 from rcirl_jax.simulation.suite import suite_refs
+from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.tuning.prior_cost import fit_prior_cost
 from rcirl_jax.tuning.recipes import SimulatedDemonstrations
 from rcirl_jax.tuning.run import Run
@@ -124,6 +130,7 @@ def _round(run: Run, number: int, learner: Path | None) -> Dataset:
         number,
         plan,
         folder,
+        config=run.config.train,
         incumbent=incumbent,
         learner=learner,
         before_commit=run.sign,
@@ -146,23 +153,31 @@ def _made(
 
 
 def expert_of(
-    plan: SimulatedDemonstrations, incumbent: str
+    plan: SimulatedDemonstrations, incumbent: str, config: TrainConfig
 ) -> tuple[Policy, Params] | None:
     """Returns the expert as a policy and its weights; None: the driver models.
 
     Args:
       plan: names the expert.
       incumbent: weights file or "hand-set", of the expert "incumbent".
+      config: of the training: the hand-set cost drives in the program of its rewards.
 
     Raises:
       InputError: a file cannot be read.
     """
     if plan.expert == "driver model":
         return None
-    score, weights = incumbent_score(
-        "hand-set" if plan.expert == "hand-set" else incumbent
-    )
-    return rank_policy(score, RankConfig()), weights
+    if plan.expert == "hand-set" or incumbent == "hand-set":
+        shape, features = config.reward, feature_map(config.features)
+        count = features.num_features
+        drawn = effective_params(init_params(jax.random.key(0), count, shape), shape)
+        unused = drawn, identity_normaliser(count)
+        row = baseline_row(
+            "hand-set", config.features, unused, RankConfig(), shape.activation
+        )
+    else:
+        row = table_rows([incumbent], ())[0]
+    return row.policy, row.params
 
 
 def drive_round(
@@ -170,6 +185,7 @@ def drive_round(
     plan: SimulatedDemonstrations,
     output: Path,
     *,
+    config: TrainConfig,
     incumbent: str,
     learner: Path | None,
     before_commit: Callable[[Dataset], object],
@@ -180,17 +196,18 @@ def drive_round(
       number: 0: the expert alone; else the round.
       plan: which cases, how long, how densely.
       output: dataset folder.
+      config: as `expert_of`.
       incumbent: as `expert_of`.
       learner: weights file of the reward learned so far; None in round 0.
       before_commit: as `DatasetWriter.finish`.
     """
-    expert, driven = expert_of(plan, incumbent), None
+    expert, driven = expert_of(plan, incumbent, config), None
     if learner is not None:
         row = table_rows([str(learner)], ())[0]
         driven = row.policy, row.params
     if driven and not plan.weight:
         expert, driven = driven, None
-    config = DriveConfig(
+    drives = DriveConfig(
         duration_s=plan.duration_s,
         stride_s=plan.takeover_stride_s if driven else plan.stride_s,
         test_fraction=0.0,
@@ -199,7 +216,7 @@ def drive_round(
     drive_catalogue(
         suite_refs("full", cases, plan.catalogue_seed + number),
         output,
-        config,
+        drives,
         expert=expert,
         learner=driven,
         overwrite=True,

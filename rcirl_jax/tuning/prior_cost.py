@@ -118,7 +118,14 @@ def _training_scenes(
 
 def scene_features(scenes: Scene, features: FeatureMap) -> np.ndarray:
     """[n, F] raw features of n scenes at t = 0, as the planner sees them."""
-    return np.asarray(_scene_features(scenes, features))
+    count = len(scenes.ego.v)
+    parts = []
+    for first in range(0, count, LANES):
+        # the last are filled up: one shape to compile
+        at = np.minimum(np.arange(first, first + LANES), count - 1)
+        some = jax.tree.map(lambda x, at=at: np.asarray(x)[at], scenes)
+        parts.append(np.asarray(_scene_features(some, features)))
+    return np.concatenate(parts)[:count]
 
 
 @functools.partial(jax.jit, static_argnames="features")
@@ -129,7 +136,7 @@ def _scene_features(scenes: Scene, features: FeatureMap) -> jax.Array:
         rows = features.rows(scene, as_candidates(straight))
         return jnp.stack([row[0, 0] for row in rows])
 
-    return jax.lax.map(one, scenes, batch_size=LANES)
+    return jax.vmap(one)(scenes)
 
 
 def fit_familiarity(

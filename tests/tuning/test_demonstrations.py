@@ -2,6 +2,7 @@
 
 import pytest
 
+from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.tuning import demonstrations
 from rcirl_jax.tuning.recipes import SimulatedDemonstrations
 from tests.helpers.weights_files import random_weights
@@ -33,13 +34,14 @@ def test_a_learner_that_only_shows_where_it_gets_to_drives_alone(
         1,
         plan,
         tmp_path / "out",
+        config=TrainConfig(),
         incumbent="hand-set",
         learner=random_weights(tmp_path / "w.msgpack"),
         before_commit=lambda dataset: None,
     )
-    hand_set = demonstrations.expert_of(plan, "hand-set")
+    hand_set = demonstrations.expert_of(plan, "hand-set", TrainConfig())
     assert hand_set is not None
     assert (asked["learner"] is None) == alone
-    assert (asked["expert"][0] is hand_set[0]) != alone
+    assert (asked["expert"][1].own == hand_set[1].own) != alone
     assert asked["stride_s"] == (plan.stride_s if alone else plan.takeover_stride_s)
     assert asked["seeds"] == {71}

@@ -25,7 +25,7 @@ from rcirl_jax.planner.baselines import (
     constant_speed_trajectory,
     idm_trajectory,
 )
-from rcirl_jax.planner.prediction import with_predicted_futures
+from rcirl_jax.planner.prediction import select_future, with_predicted_futures
 from rcirl_jax.reward import (
     SPEED_DP_ROW,
     LatticeCost,
@@ -234,12 +234,14 @@ def score_scenes(
         setup.preset,
         setup.sampler,
         float(setup.horizon_s),
-        setup.futures,
         tuple((name, type(baseline)) for name, baseline in tuned.items()),
     )
-    fields = {name: baseline.fields() for name, baseline in tuned.items()}
+    given = (
+        {name: baseline.fields() for name, baseline in tuned.items()},
+        np.bool_(setup.futures == "predicted"),
+    )
     piece = functools.partial(
-        _score_chunk, program=program, fields=fields, scorers=scorers
+        _score_chunk, program=program, given=given, scorers=scorers
     )
     parts = []
     with CompilesFirst(total=len(index), desc="rank the scenes", unit="scene") as bar:
@@ -261,20 +263,25 @@ def _score_batch(
     preset: str,
     sampler: SamplerConfig,
     horizon_s: float,
-    futures: str,
     kinds: tuple[tuple[str, type[Baseline]], ...],
 ) -> Callable:
-    """Compiles the arrays of a chunk, of `fields` of the tuned baselines, index, rows.
+    """Compiles what makes the arrays of a chunk.
+
+    Its arguments are the `fields` of the tuned baselines, whether futures are
+    predicted, index and rows.
 
     Args: as `RankingSetup`; `kinds` of the tuned baselines by name.
     """
     features, on_path = feature_map(preset), sampler.mode == "speed"
 
     def one(
-        fields: Mapping[str, Mapping], index: jax.Array, demonstration: Demonstration
+        fields: Mapping[str, Mapping],
+        predicted: jax.Array,
+        index: jax.Array,
+        demonstration: Demonstration,
     ) -> dict:
         recorded = demonstration.scene
-        scene = with_predicted_futures(recorded) if futures == "predicted" else recorded
+        scene = select_future(recorded, predicted)
         mask, human = horizon_mask(scene, horizon_s), human_of(demonstration, sampler)
         cut = scene.replace(time_valid=mask)
         candidates, fde, ade = measured(index, demonstration, scene, sampler, horizon_s)
@@ -311,18 +318,18 @@ def _score_batch(
             "human_values": {name: f(human) for name, f in baselines.items()},
         }
 
-    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0)))
+    return jax.jit(jax.vmap(one, in_axes=(None, None, 0, 0)))
 
 
 def _score_chunk(
     item: tuple[Demonstration, np.ndarray, int],
     program: tuple,
-    fields: Mapping[str, Mapping],
+    given: tuple,
     scorers: Mapping[str, Scorer | PriorCostScorer],
 ) -> Iterator[dict]:
     """Yields the arrays of one padded chunk of `chunks`, with the scorers' values."""
     rows, index, keep = item
-    made = _score_batch(*program)(fields, index, rows)
+    made = _score_batch(*program)(*given, index, rows)
     made = jax.tree.map(lambda x: np.asarray(x[:keep]), made)
     valid = made.pop("time_valid")
     both = (made.pop("features"), made.pop("features_human"))
