@@ -34,6 +34,7 @@ from rcirl_jax.features import feature_map
 from rcirl_jax.report.pages import Table, interval, part
 from rcirl_jax.report.style import CANDIDATE, LOOKS, figure, style_of, svg
 from rcirl_jax.sampling import SamplerConfig, sample
+from rcirl_jax.sampling.sampler import as_candidates
 from rcirl_jax.train.featurise import human_of
 from rcirl_jax.types import Demonstration, Normaliser, RewardParams
 
@@ -151,9 +152,13 @@ def _absolute(preset: str, sampler: SamplerConfig, activation: str) -> Callable:
         count = jnp.maximum(jnp.sum(candidates.feasible), 1)
         places = (jnp.arange(NUM_CANDIDATES) + 0.5) * count / NUM_CANDIDATES
         taken = order[places.astype(jnp.int32)]
-        chosen = jax.tree.map(lambda x: x[taken], candidates)
-        mine = features(scene, human_of(given, sampler))
-        theirs = features.of_candidates(scene, chosen)
+        both = jax.tree.map(
+            lambda many, one: jnp.concatenate([many[taken], one]),
+            candidates,
+            as_candidates(human_of(given, sampler)),
+        )
+        made = features.of_candidates(scene, both)
+        theirs, mine = made[:-1], made[-1]
         apart = jax.vmap(
             lambda x: attribute(*weights, mine, x, scene.time_valid, activation, STEPS)
         )(theirs)

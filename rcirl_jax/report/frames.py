@@ -21,6 +21,7 @@ from rcirl_jax.export.closed_loop import incumbent_score
 from rcirl_jax.export.loading import reward_params
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
+from rcirl_jax.planner.rank import Params, Score
 from rcirl_jax.report.style import (
     CANDIDATE,
     CHOSEN,
@@ -96,30 +97,25 @@ _attributed = jax.jit(attribute, static_argnames="activation")
 
 
 @functools.cache
-def _sampled(preset: str, sampler: SamplerConfig) -> Callable:
-    """Return a program: one scene -> candidates, human, and the features of both."""
+def _sampled(preset: str, sampler: SamplerConfig, own: Score | None) -> Callable:
+    """Return a program: scene, weights of `own` -> what a frame shows.
+
+    That is the candidates, the human, and of the candidates and last the human: the
+    features [K + 1, T, F] and the values [K + 1] of the own score, 0 without one.
+    """
     features = feature_map(preset)
 
-    def made(key: jax.Array, one: Demonstration) -> tuple:
+    def made(key: jax.Array, one: Demonstration, weights: Params) -> tuple:
         candidates, human = sample(key, one.scene, sampler), human_of(one, sampler)
-        x = features.of_candidates(one.scene, candidates)
-        return candidates, human, x, features(one.scene, human)
+        both = jax.tree.map(
+            lambda many, one: jnp.concatenate([many, one]),
+            candidates,
+            as_candidates(human),
+        )
+        values = own(weights, one.scene, both) if own else jnp.zeros(both.family.shape)
+        return candidates, human, features.of_candidates(one.scene, both), values
 
     return jax.jit(made)
-
-
-def _driven_by(
-    reward: Reward,
-    scene: Scene,
-    candidates: Candidates,
-    x: np.ndarray,
-    mask: np.ndarray,
-) -> np.ndarray:
-    """Return [K] what ranks the candidates: V, on top of the prior cost if any."""
-    if reward.prior_cost is None:
-        return reward.value(x, mask)
-    own, weights = incumbent_score(reward.prior_cost.incumbent)
-    return reward.total(x, np.asarray(own(weights, scene, candidates)), mask)
 
 
 def draw_frame(
@@ -134,16 +130,19 @@ def draw_frame(
     """Draw the six-panel figure of one scene, and its ST graph if a path is given."""
     rows = dataset.read(np.array([row]))
     one = jax.tree.map(lambda x: jnp.asarray(x[0]), rows)
-    made = _sampled(reward.preset, sampler)(candidates_key(jnp.asarray(row)), one)
-    candidates, human = made[:2]
-    x, x_human = map(np.asarray, made[2:])
+    prior, own = reward.prior_cost, (None, None)
+    if prior is not None:
+        own = incumbent_score(prior.incumbent)
+    program = _sampled(reward.preset, sampler, own[0])
+    made = program(candidates_key(jnp.asarray(row)), one, own[1])
+    (candidates, human), (x, by_own) = made[:2], map(np.asarray, made[2:])
     valid = np.asarray(one.scene.time_valid)
     mask = np.broadcast_to(valid, x.shape[:2])
-    values = _driven_by(reward, one.scene, candidates, x, mask)
+    every = reward.value(x, mask) if prior is None else reward.total(x, by_own, mask)
+    values, x_human = every[:-1], x[-1]
     feasible = np.asarray(candidates.feasible)
     chosen = int(np.argmax(np.where(feasible, values, -np.inf)))
     drawn = one.replace(human=human)
-    only_human = as_candidates(human)
     names = [tag.name.lower() for tag in Tag if bool(one.scene.tags[tag])]
     weights = reward_params(reward)
     parts = _attributed(*weights, x[chosen], x_human, valid, reward.activation)
@@ -170,9 +169,7 @@ def draw_frame(
         chosen=chosen,
         values=values,
         feasible=feasible,
-        human_value=float(
-            _driven_by(reward, one.scene, only_human, x_human[None], valid[None])[0]
-        ),
+        human_value=float(every[-1]),
         human_s=np.asarray(human.s),
         chosen_s=np.asarray(candidates.trajectory.s[chosen]),
         reasons=dict(zip(reward.names, reasons, strict=True)),

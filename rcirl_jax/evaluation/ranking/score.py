@@ -17,7 +17,7 @@ from rcirl_jax.data.store.rows import refuse_scenes
 from rcirl_jax.evaluation.ranking.metrics import Outcomes
 from rcirl_jax.features import feature_map
 from rcirl_jax.features.columns import COLUMNS
-from rcirl_jax.features.mapping import make_frame
+from rcirl_jax.features.mapping import candidate_frames
 from rcirl_jax.geometry.polynomial import hermite
 from rcirl_jax.planner.baselines import (
     Idm,
@@ -286,36 +286,41 @@ def _score_batch(
         cut = scene.replace(time_valid=mask)
         candidates, fde, ade = measured(index, demonstration, scene, sampler, horizon_s)
 
-        def crashes(trajectory: Trajectory) -> jax.Array:
-            hit = COLUMNS["collision"](make_frame(recorded, trajectory))
-            return jnp.any((hit > 0.0) & mask)
+        # the human's stands behind the candidates: one pass for all
+        ways = jax.tree.map(
+            lambda many, one: jnp.concatenate([many, one[None]]),
+            candidates.trajectory,
+            human,
+        )
 
-        def near_to(way: Trajectory) -> Callable[[Trajectory], jax.Array]:
-            return lambda x: closeness(x, way, mask)
+        def near_to(way: Trajectory) -> jax.Array:
+            return jax.vmap(lambda x: closeness(x, way, mask))(ways)
 
-        def valued(baseline: Baseline) -> Callable[[Trajectory], jax.Array]:
+        def valued(baseline: Baseline) -> jax.Array:
             if isinstance(baseline, Idm):
                 return near_to(idm_trajectory(scene, on_path, baseline))
-            return lambda x: -COSTS[type(baseline)](cut, x, baseline)
+            return -jax.vmap(lambda x: COSTS[type(baseline)](cut, x, baseline))(ways)
 
         tuned = {name: kind(**fields[name]) for name, kind in kinds}
         usual = {"IDM": Idm(), "hand-set": LatticeCost(), SPEED_DP_ROW: SpeedDpCost()}
-        baselines = {
+        values = {
             "constant speed": near_to(constant_speed_trajectory(scene, on_path)),
             **{name: valued(x) for name, x in {**usual, **tuned}.items()},
         }
-        ways = candidates.trajectory
+        hit = COLUMNS["collision"](candidate_frames(recorded, ways))  # [T, K + 1]
+        crash = jnp.any((hit > 0.0) & mask[:, None], axis=0)
+        made = features.of_candidates(scene, candidates.replace(trajectory=ways))
         return {
-            "features_human": features(scene, human),
-            "features": features.of_candidates(scene, candidates),
+            "features_human": made[-1],
+            "features": made[:-1],
             "feasible": candidates.feasible,
             "fde": fde,
             "ade": ade,
-            "crash": jax.vmap(crashes)(ways),
-            "human_crash": crashes(human),
+            "crash": crash[:-1],
+            "human_crash": crash[-1],
             "time_valid": mask,
-            "values": {name: jax.vmap(f)(ways) for name, f in baselines.items()},
-            "human_values": {name: f(human) for name, f in baselines.items()},
+            "values": {name: x[:-1] for name, x in values.items()},
+            "human_values": {name: x[-1] for name, x in values.items()},
         }
 
     return jax.jit(jax.vmap(one, in_axes=(None, None, 0, 0)))
