@@ -84,12 +84,11 @@ class RolloutConfig:
             raise InputError(
                 f"command_delay: {self.command_delay}: expected 0 to {MAX_DELAY} steps"
             )
-        for name in ("takeover_schedule", "frames_every"):
-            given = getattr(self, name)
-            if np.any(np.mod(given, self.span)):
-                raise InputError(
-                    f"{name}: {given}: expected multiples of {self.span} steps"
-                )
+        if self.frames_every % self.span:
+            raise InputError(
+                f"frames_every: {self.frames_every}: expected a multiple of "
+                f"{self.span} steps"
+            )
 
     @property
     def span(self) -> int:
@@ -148,9 +147,7 @@ def _seen(cases: Case, worlds: World, limits: jax.Array) -> Scene:
 def _compiled(policy: Policy, plan_every: int, length: int, vehicle: Vehicle) -> Any:  # noqa: ANN401
     """The program of a span of `length` steps."""
 
-    def tick(
-        case: Case, manner: Manner, now: Now
-    ) -> tuple[Now, tuple[Record, Snapshot]]:
+    def tick(case: Case, manner: Manner, now: Now) -> tuple[Now, jax.Array]:
         world, plan = now.worlds, now.plan
         waiting = jnp.append(command(plan, world.ego.v), now.waiting[:-1])
         late = waiting[manner.command_delay]
@@ -227,6 +224,11 @@ def rollout(
     now, limits = _begin(cases)
     logs, frames = [], []
     first, second = config.takeover_schedule
+    if len(programs) > 1 and (first % length or second % length):
+        raise InputError(
+            f"takeover_schedule: {first}, {second}: expected multiples of {length} "
+            "steps"
+        )
     for at in range(0, config.steps, length):
         if config.frames_every and at % config.frames_every == 0:
             frames.append(_seen(cases, now.worlds, limits))

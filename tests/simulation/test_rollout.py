@@ -205,6 +205,27 @@ def test_plan_every_has_to_divide_the_steps(bad):
         RolloutConfig(**bad)
 
 
+def test_frames_and_turns_begin_with_a_span():
+    with pytest.raises(InputError, match=r"frames_every: 12: .* multiple of 5 steps"):
+        RolloutConfig(frames_every=12)
+    config, case = RolloutConfig(steps=20, takeover_schedule=(7, 5)), make_case()
+    both = constant, jnp.float32(0.0)
+    with pytest.raises(InputError, match=r"takeover_schedule: 7, 5: .* of 5 steps"):
+        drive_cases(*both, stack([case]), config, takeover=both)
+
+
+def test_what_lasts_as_long_as_it_will_is_one_program():
+    """Suite and held-out drives, a plan at every step, whatever the case holds."""
+    cases = [make_case(speed=10.0), replay_case(False)]
+    with compiles("jit(run)") as made:
+        for steps in (10, 85, 200):
+            for case in cases:
+                drive([case], steps=steps, params=-1.0)
+    assert len(made) <= 2  # tables of other lengths here; one where those are alike
+    record, _ = drive([make_case(speed=10.0)], steps=7)
+    assert record.s.shape == (1, 7)
+
+
 def test_policy_and_takeover_policy_take_turns():
     """The policy brakes for 3 s, the other accelerates for 2 s, and again."""
     config = RolloutConfig(steps=100, takeover_schedule=(30, 20))
