@@ -255,6 +255,22 @@ class Lane:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class OpenRoads:
+    """Lanes that a log does not give: they are estimated from what was driven.
+
+    The recorder stood still, so that other recordings may show the same roads.
+    """
+
+    width: float  # m of a lane that has none beside it
+    limit: float | None = None  # m/s of every lane, None where the log does not say
+    why: str = ""  # no lanes are given, in words
+    # for each track [n] texts, the log's own number of the lane; none: it has none
+    labels: tuple[np.ndarray, ...] | None = None
+    # of recordings of one file that surely show one place
+    place: str = ""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Signal:
     """A traffic light as intervals of one colour each.
 
@@ -317,6 +333,8 @@ class Recording:
     # stream can be told by them; None: the log has no clock
     start_s: float | None = dataclasses.field(default=None, compare=False)
     origin: tuple[float, float] = dataclasses.field(default=(0.0, 0.0), compare=False)
+    # lanes that are still to be estimated, of this and others
+    open_roads: OpenRoads | None = dataclasses.field(default=None, compare=False)
     # share in (0, 1] of its input that is read after it, where the importer knows;
     # for the progress bar only, no part of what was recorded
     progress: float | None = dataclasses.field(default=None, compare=False)

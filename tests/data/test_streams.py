@@ -161,27 +161,84 @@ def test_ids_that_another_file_uses_again_are_others(tmp_path):
     assert "drive on" not in dataset.manifest.import_flags["split_by"]
 
 
-def test_files_of_one_place_have_its_roads_and_those_of_another_their_own(tmp_path):
-    """Two seconds have the lanes of the six minutes; the crossing keeps its own."""
+def as_csv(folder, name, rows):
+    written(folder, f"{name}.csv", rows, clock=lambda t: f"{t:.1f}")
+
+
+INTERACTION = "track_id,frame_id,timestamp_ms,agent_type,x,y,vx,vy,psi_rad,length,width"
+
+
+def as_interaction(folder, name, rows):
+    lines, before = [INTERACTION], {}
+    for t, i, x, y in rows:
+        was = before.get(i, (x - 1.0, y))
+        vx, vy = 10.0 * (x - was[0]), 10.0 * (y - was[1])
+        before[i] = x, y
+        at = f"{10 * t + 1:.0f},{1000 * t:.0f}"
+        velocity = f"{vx:.3f},{vy:.3f},{np.arctan2(vy, vx):.4f}"
+        lines.append(f"{i},{at},car,{x:.2f},{y:.2f},{velocity},4.5,1.8")
+    (folder / f"vehicle_tracks_{name}.csv").write_text("\n".join(lines) + "\n")
+
+
+def as_levelx(folder, name, rows):
+    number = "abc".index(name)
+    lines, before, seen = [LEVELX], {}, {}
+    for t, i, x, y in rows:
+        was = before.get(i, (x - 1.0, y))
+        vx, vy = 10.0 * (x - was[0]), 10.0 * (y - was[1])
+        before[i], frame = (x, y), round(10 * t)
+        seen.setdefault(i, []).append(frame)
+        heading = np.rad2deg(np.arctan2(vy, vx))
+        cells = f"{x:.2f},{y:.2f},{heading:.3f},1.8,4.5,{vx:.3f},{vy:.3f},0,0"
+        lines.append(f"{number},{i},{frame},0,{cells}")
+    metas = ["recordingId,trackId,initialFrame,finalFrame,numFrames,width,length,class"]
+    metas += [
+        f"{number},{i},{f[0]},{f[-1]},{len(f)},1.8,4.5,car" for i, f in seen.items()
+    ]
+    about = [ABOUT, f"{number},1,10,-1,0,0,6.1,50.8"]
+    tables = {"tracks": lines, "tracksMeta": metas, "recordingMeta": about}
+    for table, content in tables.items():
+        path = folder / f"{number:02d}_{table}.csv"
+        path.write_text("\n".join(content) + "\n")
+
+
+LEVELX = (
+    "recordingId,trackId,frame,trackLifetime,xCenter,yCenter,heading,width,length,"
+    "xVelocity,yVelocity,xAcceleration,yAcceleration"
+)
+ABOUT = (
+    "recordingId,locationId,frameRate,speedLimit,xUtmOrigin,yUtmOrigin,lonLocation,"
+    "latLocation"
+)
+
+
+@pytest.mark.parametrize(
+    ("form", "write"),
+    [("csv", as_csv), ("interaction", as_interaction), ("levelx", as_levelx)],
+)
+def test_files_of_one_place_have_its_roads_and_those_of_another_their_own(
+    tmp_path, form, write
+):
+    """Four seconds have the lanes of the four minutes; the crossing keeps its own."""
     logs, road = tmp_path / "logs", highway(minutes=4.0)
     logs.mkdir()
 
     def rows_of(tracks, low, high):
-        for track in tracks:
+        for number, track in enumerate(tracks):
             first, last = max(track.t[0], low), min(track.t[-1], high)
             for t in np.arange(np.ceil(10.0 * first), 10.0 * last) / 10.0:
                 x, y = (np.interp(t, track.t, one) for one in (track.x, track.y))
-                yield t, track.id, x, y
+                yield t, number, x, y
 
-    written(logs, "a.csv", rows_of(road.tracks, 0.0, 238.0))
-    written(logs, "b.csv", rows_of(road.tracks, 238.0, 240.0))
-    written(logs, "c.csv", rows_of(crossing(minutes=3.0).tracks, 0.0, 180.0))
-    found = {one.name: one for one in read_logs(logs, format="csv")}
-    assert "of 2 files" in found["a"].notes[-1]
-    assert "of 2 files" in found["b"].notes[-1]
-    assert "files" not in found["c"].notes[-1]
-    names = [[lane.id for lane in found[name].lanes] for name in "abc"]
+    write(logs, "a", rows_of(road.tracks, 0.0, 236.0))
+    write(logs, "b", rows_of(road.tracks, 236.0, 240.0))
+    write(logs, "c", rows_of(crossing(minutes=3.0).tracks, 0.0, 180.0))
+    found = list(read_logs(logs, format=form))
+    notes = [[n for n in one.notes if "estimated from all" in n] for one in found]
+    assert ["of 2 files" in note for (note,) in notes] == [True, True, False]
+    assert "files" not in notes[2][0]
+    names = [[lane.id for lane in one.lanes] for one in found]
     assert names[0] == names[1]
     assert len(names[2]) > 12
-    for lane, other in zip(found["a"].lanes, found["b"].lanes, strict=True):
+    for lane, other in zip(found[0].lanes, found[1].lanes, strict=True):
         np.testing.assert_allclose(lane.centre, other.centre)

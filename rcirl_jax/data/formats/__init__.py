@@ -18,6 +18,7 @@ from rcirl_jax.data.formats.declared import with_numbers_and_texts
 from rcirl_jax.data.formats.files import log_name, with_log_names
 from rcirl_jax.data.formats.format import Format
 from rcirl_jax.data.formats.options import USER_KEYS, check_options
+from rcirl_jax.data.formats.sites import BESIDE, beside, with_roads
 from rcirl_jax.data.readers.tables.rows import NoRowsError
 from rcirl_jax.data.readers.tables.streams import refuse_pointer
 from rcirl_jax.data.recording import empty_recording
@@ -41,7 +42,7 @@ def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
         refuse_pointer(file)
     with as_input_error(str(path), f"a sound log of format {name}"):
         try:
-            yield from importer(path, spec)
+            yield from with_roads(name, importer, path, spec)
         except NoRowsError as error:
             if error.path != path:
                 raise  # a table beside the log
@@ -81,7 +82,7 @@ def parts(
     The recordings of all parts, one part after the other, are those of the whole
     input. A format whose module has no `parts(path, spec)` is one part. Where it has
     `own_name(file)`, logs that are called alike in several folders are told apart;
-    where it has `shared_by(files)`, that is what the spec says of all of them.
+    lanes that a log does not give are those of all files that show one place.
 
     Args:
       name: key of `IMPORTERS`.
@@ -118,8 +119,7 @@ def parts(
         name_of = getattr(module, "own_name", None)
         if name_of is not None:
             spec = with_log_names(input_path, found, spec, name_of)
-        if (shared_by := getattr(module, "shared_by", None)) is not None:
-            spec = {**spec, **shared_by(found)}
+        spec = {**spec, BESIDE: beside(found)}
     for path in found:
         if not is_text(str(path)):
             raise InputError(f"{path}: name: {path.name!a}: expected UTF-8; rename it")

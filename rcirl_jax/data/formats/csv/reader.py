@@ -8,8 +8,7 @@ in float32 later.
 import collections
 import dataclasses
 import itertools
-import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import msgspec
@@ -51,10 +50,9 @@ from rcirl_jax.data.readers.long_logs import rows_of
 from rcirl_jax.data.readers.tables.rows import Rows, RowStats, attach_row_stats
 from rcirl_jax.data.readers.tables.table import Table
 from rcirl_jax.data.recording import validate_recording
-from rcirl_jax.data.roads import Roads, roads_from_tracks, roads_of_sites
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.checked import checked
-from rcirl_jax.types import Kind, Lane, MissingAgent, Recording, Track
+from rcirl_jax.types import Kind, Lane, MissingAgent, OpenRoads, Recording, Track
 
 PATTERNS = (
     *("*.csv", "*.csv.gz", "*.csv.zst", "*.csv.bz2"),
@@ -67,11 +65,6 @@ REFERENCE = {"centre": 0.0, "front": -0.5, "rear": 0.5}
 SIZE_M = {"length": 4.5, "width": 1.8}  # m, a car
 MARGIN_M = 50.0  # m of fitted lane beyond the first and last position
 LIMIT_MPS = 29.06  # m/s, 65 mph
-ALONE = "alone"  # in a spec: tracks are wanted, and no lanes
-MAX_FILES = 12  # of an import whose roads are estimated together, evenly
-THIN_HZ = 5.0  # 1/s, of tracks that roads are estimated from
-BESIDE = "beside"  # in a spec: files of the import whose roads are pooled
-_SITES: dict[str, dict[Path, Roads]] = {}  # by spec and files, then by file
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -121,7 +114,6 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     Of a file too long for memory one per minute.
     """
     for file in parts(path, spec):
-        site = None if ALONE in spec else _site_of(file, spec)
         log = opened(file, spec)
         columns, own = log.columns, log_name(file, spec, own_name(file))
         with rows_of(
@@ -141,7 +133,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
                 name = own if recording is None else f"{own}-{recording}"
                 for part in rows.slices(recording, MAX_GAP_STEPS / columns.rate_hz):
                     values = meaning.applied(log.placed(part.values))
-                    of = (values, log, meaning, site)
+                    of = (values, log, meaning)
                     made = _recording(f"{name}{part.label}", recording, *of)
                     made = dataclasses.replace(made, start_s=part.start)
                     made = attach_row_stats(part.of_log(name, made), log.stats)
@@ -154,63 +146,12 @@ def opened(file: Path, spec: dict) -> Log:
     return Log(table=table, spec=spec, columns=columns_of(table, spec), stats=stats)
 
 
-def shared_by(files: Sequence[Path]) -> dict:
-    """Returns what the spec says of all files: those whose roads are pooled."""
-    chosen = np.linspace(0, len(files) - 1, min(len(files), MAX_FILES)).round()
-    return {BESIDE: [str(files[int(n)]) for n in chosen]}
-
-
-def _site_of(file: Path, spec: dict) -> Roads | None:
-    """Returns the roads of a file's site, of all files there; None: of itself alone.
-
-    Minutes of a long file, and files of one import that show one place, have the same
-    roads. Files that say numbers of lanes are taken alone.
-    """
-    files = [*dict.fromkeys([*map(Path, spec.get(BESIDE, [])), file])]
-    if spec.get("lanes") or (len(files) == 1 and not is_long_file(file, spec)):
-        return None
-    key = json.dumps([spec, list(map(str, files))], sort_keys=True, default=str)
-    if key not in _SITES:
-        tracks = {one: _driven_in(one, {**spec, ALONE: True}) for one in files}
-        known = {one: some for one, some in tracks.items() if some}
-        width = number(spec, "lane_width_m", LANE_WIDTH_M)
-        limit = stated(spec, "speed_limit")
-        roads = roads_of_sites([*known.values()], width=width, limit=limit)
-        _SITES.clear()  # of one import at a time
-        _SITES[key] = dict(zip(known, roads, strict=True))
-    return _SITES[key].get(file)
-
-
-def _driven_in(file: Path, spec: dict) -> list[Track]:
-    """Returns the tracks of a file in the log's frame, thinned; [] where it has none.
-
-    A file that cannot be read says so when it is imported itself.
-    """
-    found = []
-    try:
-        if any(field.name == "lane" for field in opened(file, spec).columns.fields):
-            return []
-        for recording in recordings(file, spec):
-            step = max(round(recording.rate_hz / THIN_HZ), 1)
-            for track in recording.tracks:
-                thin = {n: getattr(track, n)[::step] for n in ("t", "heading", "speed")}
-                place = {
-                    name: getattr(track, name)[::step] + recording.origin[at]
-                    for at, name in enumerate(("x", "y"))
-                }
-                found.append(dataclasses.replace(track, **thin, **place))
-    except InputError:
-        return []
-    return found
-
-
 def _recording(
     name: str,
     recording: str | None,
     values: Rows,
     log: Log,
     meaning: Meaning,
-    site: Roads | None,
 ) -> Recording:
     path, spec, columns = log.table.path, log.spec, log.columns
     span = max(np.ptp(values["x"]), np.ptp(values["y"]))
@@ -233,9 +174,9 @@ def _recording(
     )
     numbers = values.get("lane")
     labels = None if numbers is None else [numbers[rows] for _, rows in pieces]
-    lanes, notes = (), []
-    if ALONE not in spec:
-        lanes, notes = _lanes(values, tracks, labels, log, origin, site)
+    lanes, open_roads, notes = _lanes(values, tracks, labels, log, origin)
+    if open_roads is not None:
+        open_roads = dataclasses.replace(open_roads, place=recording or "")
     return Recording(
         name=name,
         source=str(spec.get("source", "CSV log")),
@@ -243,6 +184,7 @@ def _recording(
         rate_hz=columns.rate_hz,
         tracks=tracks,
         lanes=lanes,
+        open_roads=open_roads,
         origin=(float(origin[0]), float(origin[1])),
         missing_agents=_missing(spec, recording, origin),
         default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
@@ -310,24 +252,20 @@ def _lanes(
     labels: list[np.ndarray] | None,
     log: Log,
     origin: np.ndarray,
-    site: Roads | None,
-) -> tuple[tuple[Lane, ...], list[str]]:
-    """The lanes given; else straight ones of the lane column; else by all tracks."""
+) -> tuple[tuple[Lane, ...], OpenRoads | None, list[str]]:
+    """The lanes given; else straight ones of the lane column; else they are open."""
     path, spec = log.table.path, log.spec
     given = lanes_of_toml(path, spec, lambda p: log.columns.metres(p) - origin)
     if given:
-        return given, []
+        return given, None, []
     limit = stated(spec, "speed_limit")
     width = number(spec, "lane_width_m", LANE_WIDTH_M)
     found = _straight(values, tracks, width) if "lane" in values else None
     if found:
         lanes = straight_lanes(path, found, width, limit)
-        return lanes, ["straight lanes fitted to the lane column"]
-    if site is not None:
-        share = site.moved(-origin)
-        return share.lanes, [share.note]
-    roads = roads_from_tracks(tracks, width=width, limit=limit, labels=labels)
-    return roads.lanes, [roads.note]
+        return lanes, None, ["straight lanes fitted to the lane column"]
+    own = None if labels is None else tuple(labels)
+    return (), OpenRoads(width=width, limit=limit, labels=own), []
 
 
 def _straight(

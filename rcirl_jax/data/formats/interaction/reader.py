@@ -38,9 +38,8 @@ from rcirl_jax.data.readers.tables.rows import (
 )
 from rcirl_jax.data.readers.tables.table import fields_of, open_table, read
 from rcirl_jax.data.recording import accepted, validate_recording
-from rcirl_jax.data.roads import roads_from_tracks
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Lane, Recording, Track
+from rcirl_jax.types import Kind, Lane, OpenRoads, Recording, Track
 
 NEEDED = {
     **{"track_id": "text", "timestamp_ms": "time", "agent_type": "text"},
@@ -67,7 +66,7 @@ class _Scene:
 
     path: Path
     spec: dict
-    lanes: tuple[Lane, ...] | None  # None: fitted to the paths of each
+    lanes: tuple[Lane, ...] | None  # None: they are estimated
     limit: float  # m/s, of lanes without one
     notes: tuple[str, ...]
 
@@ -172,7 +171,7 @@ def _read(path: Path, spec: dict) -> tuple[Rows, RowStats]:
 def _scene(path: Path, spec: dict) -> _Scene:
     place = _find_map(path, spec)
     limit = number(spec, "default_speed_limit")
-    lanes, notes = None, ["no map found; lanes estimated from all tracks"]
+    lanes, notes = None, []
     if place is not None:
         zone = utm_zone(0.0)
         origin = utm(np.zeros(1), np.zeros(1), zone)
@@ -221,9 +220,10 @@ def _recording(name: str, rows: Rows, scene: _Scene, group: str | None) -> Recor
         _track(label, {field: rows[field][at] for field in rows}, scene)
         for label, at in split_tracks(scene.path, rows["track_id"], stamps, MAX_GAP_MS)
     )
-    lanes = scene.lanes
-    if lanes is None:
-        lanes = roads_from_tracks(tracks, width=number(spec, "lane_width_m")).lanes
+    open_roads = None
+    if scene.lanes is None:
+        width = number(spec, "lane_width_m")
+        open_roads = OpenRoads(width=width, why="no map found")
     kinds = set(np.unique(rows["agent_type"])) - {EITHER}
     return Recording(
         name=name,
@@ -231,7 +231,8 @@ def _recording(name: str, rows: Rows, scene: _Scene, group: str | None) -> Recor
         licence=spec["licence"],
         rate_hz=number(spec, "rate_hz"),
         tracks=tracks,
-        lanes=lanes,
+        lanes=scene.lanes or (),
+        open_roads=open_roads,
         group=group,
         default_speed_limit=scene.limit,
         notes=(*scene.notes, *unknown_kinds("agent types", kinds)),

@@ -42,9 +42,8 @@ from rcirl_jax.data.readers.tables.table import (
     read,
 )
 from rcirl_jax.data.recording import check_lanes_length, check_span, validate_recording
-from rcirl_jax.data.roads import roads_from_tracks
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Lane, Recording, Track
+from rcirl_jax.types import Kind, Lane, OpenRoads, Recording, Track
 
 SUFFIX, USERS, META = "_tracks.csv", "_tracksMeta.csv", "_recordingMeta.csv"
 NEEDED = {
@@ -138,8 +137,9 @@ def _recording(table: Table, spec: dict, stats: RowStats) -> Recording:
     if is_corner:
         sides = {side: _markings(about, f"{side}LaneMarkings") for side in SIDES}
         lanes, notes = _marked_lanes(path, sides, rows, limit), []
+        open_roads = None
     else:
-        lanes, notes = _mapped_lanes(about, meta, tracks, spec)
+        lanes, open_roads, notes = _mapped_lanes(about, meta, tracks, spec)
     met = set(ids.tolist())
     missing = len(set(users) - met)
     notes += [f"{missing} tracks of tracksMeta have no rows"] if missing else []
@@ -153,6 +153,7 @@ def _recording(table: Table, spec: dict, stats: RowStats) -> Recording:
         rate_hz=rate,
         tracks=tuple(tracks),
         lanes=lanes,
+        open_roads=open_roads,
         default_speed_limit=limit or number(spec, "default_speed_limit"),
         notes=tuple(notes),
     )
@@ -288,8 +289,8 @@ def _markings(table: Table, field: str) -> np.ndarray:
 
 def _mapped_lanes(
     table: Table, meta: Mapping[str, float], tracks: list[Track], spec: dict
-) -> tuple[tuple[Lane, ...], list[str]]:
-    """Lanes of the location's Lanelet2 map; else fitted to the paths driven."""
+) -> tuple[tuple[Lane, ...], OpenRoads | None, list[str]]:
+    """Lanes of the location's Lanelet2 map; else they are open."""
     location = table.samples("locationId") if table.has("locationId") else [""]
     place, why = _find_map(table.path, location[0], spec), "no map found"
     if place is not None:
@@ -299,10 +300,9 @@ def _mapped_lanes(
         middle = [np.median([np.median(getattr(t, c)) for t in tracks]) for c in "xy"]
         apart = (float(np.min(np.hypot(*(ln.centre - middle).T))) for ln in lanes)
         if min(apart) < FAR_M:
-            return lanes, notes
+            return lanes, None, notes
         why = f"{place.name} lies elsewhere"
-    roads = roads_from_tracks(tracks, width=number(spec, "lane_width_m"))
-    return roads.lanes, [f"{why}: {roads.note}"]
+    return (), OpenRoads(width=number(spec, "lane_width_m"), why=why), []
 
 
 def _find_map(path: Path, location: str, spec: dict) -> Path | None:

@@ -40,9 +40,8 @@ from rcirl_jax.data.readers.tables.rows import (
 from rcirl_jax.data.readers.tables.streams import head_of
 from rcirl_jax.data.readers.tables.table import Table, open_table
 from rcirl_jax.data.recording import validate_recording
-from rcirl_jax.data.roads import roads_from_tracks
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Recording, Track
+from rcirl_jax.types import Kind, OpenRoads, Recording, Track
 
 COLUMN = re.compile(r"(Speed|Lat|Lon|E|N|IVS|Driver)(\d{1,3})")
 KINDS = {"Driver": "text", "Speed": "speed", "E": "place", "N": "place"}  # of cells
@@ -272,7 +271,7 @@ def _blocks(path: Path, spec: dict, stats: RowStats) -> Iterator[Recording]:
         tracks, origin = _tracks(path, t, cars, rows, automated, MAX_GAP_STEPS / rate)
         if not tracks:
             continue
-        found, roads = True, roads_from_tracks(tracks, width=width)
+        found = True
         where = f"local origin at E = {origin[0]:.0f} m, N = {origin[1]:.0f} m"
         yield Recording(
             name=name if numbers.size == 1 else f"{name}-{int(block):04d}",
@@ -280,11 +279,13 @@ def _blocks(path: Path, spec: dict, stats: RowStats) -> Iterator[Recording]:
             licence=spec["licence"],
             rate_hz=rate,
             tracks=tracks,
-            lanes=roads.lanes,
+            lanes=(),
+            open_roads=OpenRoads(width=width),
+            origin=(float(origin[0]), float(origin[1])),
             # files of one day share cars and drivers
             group=f"drives of {date}" if date else path.stem,
             default_speed_limit=number(spec, "default_speed_limit"),
-            notes=(*notes, *([where] if origin.any() else []), roads.note),
+            notes=(*notes, *([where] if origin.any() else [])),
         )
     if not found:
         raise InputError(
