@@ -1,10 +1,11 @@
-// Ten candidates beside two cars, judged by a learned reward: own_planner WEIGHTS.
-// The Python twin, own_planner.py, prints the same numbers.
+// Ten candidates beside two cars, filtered, then judged by a learned reward:
+// own_planner WEIGHTS. The Python twin, own_planner.py, prints the same numbers.
 #include <algorithm>
 #include <cstdio>
+#include <string>
 #include <vector>
 
-#include "rcirl/features.hpp"
+#include "rcirl/choose.hpp"
 #include "rcirl/scene_builder.hpp"
 
 constexpr double kSpeed = 12.0;  // m/s, the ego's
@@ -32,7 +33,7 @@ std::vector<float> candidates() {
 
 int main(int count, char** arguments) {
   rcirl::Reward reward;
-  rcirl::FeatureMap columns;
+  rcirl::Chooser chooser;
   rcirl::Scene scene;
   rcirl::Surroundings now;  // metres, radians, any Cartesian frame
   now.ego.speed = kSpeed, now.ego.length = 4.9, now.ego.width = 2.1;
@@ -40,21 +41,22 @@ int main(int count, char** arguments) {
   now.line.speed_limit = {13.9};
   now.others = {car(30.0, 0.0, 8.0), car(-15.0, 3.6, 14.0)};
   rcirl::Status status = rcirl::load(count == 2 ? arguments[1] : "", &reward);
-  if (status.ok()) status = rcirl::feature_map(reward, &columns);
+  if (status.ok()) status = rcirl::chooser(reward, {}, &chooser);
   if (status.ok()) status = rcirl::scene_from(now, &scene);
   if (!status.ok()) {
     std::fprintf(stderr, "%s\n", status.message().c_str());
     return 2;
   }
+  std::printf("%s\n", describe(reward).c_str());  // what it was trained for, and what not
   const std::vector<float> s = candidates();
-  std::vector<float> features(10 * rcirl::kTimes * columns.size()), values(10);
-  std::vector<float> own{-3, -2.5, -2, -1.5, -1, -0.5, 0, -0.5, -1, -1.5};  // -cost of your planner
-  rcirl::Workspace workspace = reward.workspace();
-  columns.compute(scene, {s.data(), nullptr, 10}, features.data());
-  const rcirl::Mask valid = columns.mask(scene);
-  float *const at = features.data(), *const to = values.data();
-  if (!reward.has_prior_cost()) reward.score(at, 10, valid, &workspace, to);
-  if (reward.has_prior_cost()) reward.total(at, 10, valid, own.data(), &workspace, to);
-  for (std::size_t k = 0; k < 10; ++k) std::printf("candidate %zu: %.9g\n", k, double{values[k]});
-  std::printf("best: candidate %zu\n", rcirl::best(values.data(), 10));
+  const std::vector<float> own{-3, -2.5, -2, -1.5, -1, -0.5, 0, -0.5, -1, -1.5};  // -your cost
+  // the safety filter first, then the value
+  const rcirl::Choice choice = chooser.choose(scene, {s.data(), nullptr, 10}, own.data());
+  for (std::size_t k = 0; k < 10; ++k) {
+    const std::string why = text(chooser.rulings()[k]);
+    std::printf("candidate %zu: %.9g %s\n", k, double{chooser.values()[k]},
+                why.empty() ? "is admissible" : why.c_str());
+  }
+  if (choice.found()) std::printf("best: candidate %zu\n", choice.best);
+  if (!choice.found()) std::printf("%s\n", chooser.why().c_str());
 }

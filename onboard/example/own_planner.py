@@ -1,20 +1,21 @@
-"""Ten candidates beside two cars, judged by a learned reward. Needs numpy and msgpack.
+"""Ten candidates beside two cars: filtered, then judged by a learned reward.
 
     python own_planner.py weights.msgpack
 
-Beside it: copies of features/columns.py, units.py, export/own_planner/features.py and
-export/reader.py of rcirl_jax. The C++ twin, own_planner.cpp, prints the same numbers.
+Needs numpy and msgpack. Beside it: copies of features/columns.py, units.py,
+planner/safety.py, export/reader.py, and of features.py and choose.py in
+export/own_planner of rcirl_jax. The C++ twin, own_planner.cpp, prints the same numbers.
 """
 
 import sys
 
 import numpy as np
+from choose import choose
 from features import (
     HORIZON_S,
     NUM_STATIONS,
     NUM_TIMES,
     Ego,
-    FeatureMap,
     Kind,
     Obstacle,
     Path,
@@ -41,7 +42,7 @@ def car(s: float, l: float, speed: float) -> Obstacle:
 
 
 reward = load_weights(sys.argv[1])
-columns = FeatureMap(reward.names, reward.units)  # the file's columns, in its order
+print(reward.describe())  # what it was trained for, and what not
 flat = np.zeros(NUM_STATIONS)
 scene = Scene(
     ego=Ego(v=SPEED, length=4.9, width=2.1),
@@ -51,10 +52,8 @@ scene = Scene(
 a = -3.0 + 0.5 * np.arange(10)[:, None]  # m/s^2, held until the ego stands
 t = np.minimum(TIMES, SPEED / np.maximum(-a, 1e-9))
 s = SPEED * t + 0.5 * a * t * t  # [10, T] m along the given path
-found, valid = columns(scene, s), scene.time_valid
 own = -np.abs(a[:, 0])  # for a prior cost: your planner's own costs, negated
-alone = reward.prior_cost is None
-values = reward.value(found, valid) if alone else reward.total(found, own, valid)
-for number, value in enumerate(values):
-    print(f"candidate {number}: {value:.9g}")
-print(f"best: candidate {np.argmax(values)}")
+choice = choose(reward, scene, s, own=own)  # the safety filter first, then the value
+for number, (value, why) in enumerate(zip(choice.values, choice.why, strict=True)):
+    print(f"candidate {number}: {value:.9g} {why or 'is admissible'}")
+print(f"best: candidate {choice.best}" if choice.best is not None else choice.none)

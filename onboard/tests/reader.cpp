@@ -9,6 +9,9 @@
 //                                            float32 features [K, T, F] and scores [K]
 //   reader admit CASES                    -> for each case float32 rulings [K, 3]: reason,
 //                                            obstacle and time, -1 if none
+//   reader choose GUARD WEIGHTS CASES [OWN]  -> for each case "best, K if none" and why, a line;
+//                                            then of each candidate its value and why not.
+//                                            OWN: float32 own values, case after case
 //   reader describe WEIGHTS               -> what the reward says of itself
 //   reader check BATCH                    -> for each file of BATCH, its bytes after
 //                                            their number as uint64, "ok" or its refusal
@@ -21,6 +24,7 @@
 #include <vector>
 
 #include "flat.hpp"
+#include "rcirl/choose.hpp"
 #include "rcirl/features.hpp"
 #include "rcirl/guard.hpp"
 #include "rcirl/reward.hpp"
@@ -130,6 +134,35 @@ int admit(const char* cases) {
   return 0;
 }
 
+int choose(const char* guard, const char* weights, const char* cases, const char* own) {
+  rcirl::Reward reward;
+  rcirl::Chooser chooser;
+  rcirl::Status status = rcirl::load(weights, &reward);
+  rcirl::ChooseOptions options;
+  options.guard = std::strcmp(guard, "guard") == 0;
+  if (status.ok()) status = rcirl::chooser(reward, options, &chooser);
+  if (!status.ok()) {
+    std::fprintf(stderr, "%s\n", status.message().c_str());
+    return 2;
+  }
+  const std::vector<float> numbers = floats(cases), given = own ? floats(own) : numbers;
+  Numbers source = {numbers.data(), numbers.data() + numbers.size()};
+  const float* next = own != nullptr ? given.data() : nullptr;
+  Case one;
+  while (source.at != source.end) {
+    if (!take_case(source, &one)) return 2;
+    const rcirl::Candidates candidates = one.candidates();
+    const rcirl::Choice choice = chooser.choose(one.scene, candidates, next);
+    if (next != nullptr) next += candidates.count;
+    std::printf("%zu %s\n", choice.best, chooser.why().c_str());
+    for (std::size_t k = 0; k < candidates.count; ++k) {
+      std::printf("%.9g %s\n", static_cast<double>(chooser.values()[k]),
+                  text(chooser.rulings()[k]).c_str());
+    }
+  }
+  return 0;
+}
+
 int describe(const char* weights) {
   rcirl::Reward reward;
   const rcirl::Status status = rcirl::load(weights, &reward);
@@ -190,6 +223,9 @@ int main(int count, char** arguments) {
   const std::string mode = count > 1 ? arguments[1] : "";
   if (mode == "check" && count == 3) return check(arguments[2]);
   if (mode == "admit" && count == 3) return admit(arguments[2]);
+  if (mode == "choose" && (count == 5 || count == 6)) {
+    return choose(arguments[2], arguments[3], arguments[4], count == 6 ? arguments[5] : nullptr);
+  }
   if (mode == "describe" && count == 3) return describe(arguments[2]);
   if (mode == "features" && count == 4) return features(arguments[2], arguments[3]);
   if ((mode == "score" || mode == "guard") && (count == 4 || count == 5)) {
@@ -204,6 +240,7 @@ int main(int count, char** arguments) {
   }
   std::fprintf(stderr,
                "reader: arguments: expected score or guard WEIGHTS FEATURES [MASK] | "
-               "total WEIGHTS FEATURES OWN [MASK] | features WEIGHTS CASES | admit CASES | describe WEIGHTS | check BATCH\n");
+               "total WEIGHTS FEATURES OWN [MASK] | features WEIGHTS CASES | admit CASES | "
+               "choose GUARD WEIGHTS CASES [OWN] | describe WEIGHTS | check BATCH\n");
   return 2;
 }

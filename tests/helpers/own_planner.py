@@ -27,14 +27,27 @@ def every_column():
     return FeatureMap("every", tuple(specs.values()))
 
 
-def drawn_reward(path, columns, hidden=(15,), scene_gating=False, seed=3):
-    """A weights file of these columns at the usual times, of weights as trained."""
+def drawn_reward(
+    path, columns, hidden=(15,), scene_gating=False, seed=3, mode=None,
+    with_prior=False, fastest=None,
+):  # fmt: skip
+    """A weights file of these columns at the usual times, of weights as trained.
+
+    `fastest` m/s is the highest speed that the training saw.
+    """
     specs, rng = columns.specs, np.random.default_rng(seed)
     size = len(specs)
-    drawn = example_weights(seed, size, TIMES_S.size, hidden, "tanh", scene_gating)
+    shape = (seed, size, TIMES_S.size, hidden, "tanh", scene_gating)
+    drawn = example_weights(*shape, with_prior=with_prior)
+    if mode is not None:
+        provenance = {**drawn.provenance, "mode": mode}
+        drawn = dataclasses.replace(drawn, provenance=provenance)
     lower, upper = (
         np.array([getattr(s, n) for s in specs]) for n in ("lower", "upper")
     )
+    seen = upper.copy()
+    if fastest is not None:
+        seen[columns.names.index("velocity")] = fastest
     gates = drawn.scene_gating
     if gates is not None:  # as training leaves it: what candidates share at t = 0
         gates = gates / size * np.array(columns.context)[:, None]
@@ -44,7 +57,7 @@ def drawn_reward(path, columns, hidden=(15,), scene_gating=False, seed=3):
         **columns_of(specs),
         lower=lower,
         upper=upper,
-        training_range=np.stack([lower, upper]),
+        training_range=np.stack([lower, seen]),
         location=np.array([spec.none for spec in specs]),
         scale=0.3 * (upper - lower),
         times=TIMES_S,

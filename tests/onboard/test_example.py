@@ -13,9 +13,10 @@ import pytest
 
 from rcirl_jax import Body, Car, CentreLine, load_weights, scene_from, units
 from rcirl_jax.export import reader
-from rcirl_jax.export.own_planner import features
+from rcirl_jax.export.own_planner import choose, features
 from rcirl_jax.export.own_planner.builder import plain_scene
 from rcirl_jax.features import columns
+from rcirl_jax.planner import safety
 from tests.export.test_weights import golden
 from tests.helpers.own_planner import TOLERANCE, error, numpy_answers
 from tests.onboard.programs import ONBOARD, built, run
@@ -28,7 +29,7 @@ def stranger(tmp_path_factory):
     """A folder with the files and the program, and where only two packages are."""
     folder, packages = (tmp_path_factory.mktemp(name) for name in ("own", "packages"))
     program = ONBOARD / "example" / "own_planner.py"
-    for module in (features, columns, units, reader):
+    for module in (features, choose, columns, safety, units, reader):
         shutil.copy(inspect.getfile(module), folder)
     shutil.copy(program, folder)
     for package in (np, msgpack):
@@ -49,23 +50,34 @@ def in_python(stranger, *arguments):
     return run(*command, cwd=folder, env=environment).decode()
 
 
-def values(said):
-    """The ten values and the best of what a program prints."""
-    *lines, best = said.splitlines()
-    assert [line.split(":")[0] for line in lines] == [
-        f"candidate {k}" for k in range(10)
-    ]
-    found = np.array([float(line.split(":")[1]) for line in lines])
-    assert best == f"best: candidate {np.argmax(found)}"
-    return found
+def answer(said, weights):
+    """The ten values of what a program prints, and why each is not admissible."""
+    *told, best = said.splitlines()
+    about, lines = told[:-10], [line.split(" ", 3) for line in told[-10:]]
+    assert about == load_weights(weights).describe().splitlines()
+    assert [name for _, name, *_ in lines] == [f"{k}:" for k in range(10)]
+    found = np.array([float(value) for *_, value, _ in lines])
+    why = [text for *_, text in lines]
+    admissible = np.array([text == "is admissible" for text in why])
+    chosen = np.argmax(np.where(admissible, found, -np.inf))
+    assert best == f"best: candidate {chosen}"
+    return found, why
 
 
 @pytest.mark.parametrize("weights", WEIGHTS, ids=lambda path: path.stem)
 def test_both_programs_print_what_the_package_says(stranger, twin, weights):
     shutil.copy(weights, stranger[0] / "weights.msgpack")
-    found = values(in_python(stranger, "own_planner.py", "weights.msgpack"))
+    said = in_python(stranger, "own_planner.py", "weights.msgpack")
+    found, why = answer(said, weights)
     assert np.ptp(found) > 0.1
-    assert error(values(run(twin, weights).decode()), found) <= TOLERANCE
+    in_cpp, why_in_cpp = answer(run(twin, weights).decode(), weights)
+    assert error(in_cpp, found) <= TOLERANCE
+    assert why_in_cpp == why
+    # who does not brake hits the car ahead, which the value alone does not say
+    hits = [text.startswith("hits obstacles[0] after ") for text in why]
+    assert hits == [k >= 6 for k in range(10)]
+    best = int(np.argmax(found))
+    assert hits[best] == (weights.stem == "apollo21")
 
     a = -3.0 + 0.5 * np.arange(10)[:, None]
     t = np.minimum(8.0 * np.arange(18) / 17.0, 12.0 / np.maximum(-a, 1e-9))
@@ -87,6 +99,11 @@ def test_both_programs_print_what_the_package_says(stranger, twin, weights):
     assert error(found, wanted) <= TOLERANCE
 
 
+def test_the_choice_needs_no_file_of_the_guard(stranger):
+    command = "import choose, reader, sys; assert 'guard' not in sys.modules"
+    in_python(stranger, "-c", command)
+
+
 def test_the_stranger_has_numpy_and_msgpack_only(stranger):
     for name in ("jax", "scipy", "rcirl_jax"):
         with pytest.raises(AssertionError, match=f"No module named '{name}'"):
@@ -106,6 +123,8 @@ def test_choose_adds_a_reward_with_a_prior_cost_to_the_costs(tmp_path):
     costs = np.linspace(2.0, -3.0, len(features), dtype="<f4")
     (tmp_path / "costs.f32").write_bytes(costs.tobytes())
     (tmp_path / "few.f32").write_bytes(costs[1:].tobytes())
+    may = np.ones(len(features), np.uint8)
+    (tmp_path / "all").write_bytes(may.tobytes())
 
     def said(*arguments):
         command = [choose, *arguments]
@@ -114,17 +133,25 @@ def test_choose_adds_a_reward_with_a_prior_cost_to_the_costs(tmp_path):
         )
 
     total = load_weights(weights).total(features, -costs)
-    done = said(weights, tmp_path / "costs.f32")
-    start = f"candidate {np.argmax(total)} of {len(total)}, value "
+    best = int(np.argmax(total))
+    may[best] = 0
+    (tmp_path / "others").write_bytes(may.tobytes())
+    second = int(np.argmax(np.where(may, total, -np.inf)))
+    done = said(weights, tmp_path / "others", tmp_path / "costs.f32")
+    assert done.stdout.decode().startswith(f"candidate {second} of "), done.stderr
+    done = said(weights, tmp_path / "all", tmp_path / "costs.f32")
+    start = f"candidate {best} of {len(total)}, value "
     assert done.stdout.decode().startswith(start), done.stderr
     value = float(done.stdout.decode().removeprefix(start).split(",")[0])
     assert value == pytest.approx(total.max(), rel=1e-5)
     alone = WEIGHTS[0]
     for arguments, wanted in (
-        ((weights,), "COSTS as a second argument"),
-        ((weights, tmp_path / "few.f32"), f"expected {len(costs)}"),
-        ((weights, tmp_path / "none.f32"), "costs: 0 numbers"),
-        ((alone, tmp_path / "costs.f32"), "expected no COSTS"),
+        ((weights,), "expected WEIGHTS ADMISSIBLE [COSTS]"),
+        ((weights, tmp_path / "all"), "COSTS as a third argument"),
+        ((weights, tmp_path / "none", tmp_path / "costs.f32"), "admissible: 0 bytes"),
+        ((weights, tmp_path / "all", tmp_path / "few.f32"), f"expected {len(costs)}"),
+        ((weights, tmp_path / "all", tmp_path / "none.f32"), "costs: 0 numbers"),
+        ((alone, tmp_path / "all", tmp_path / "costs.f32"), "expected no COSTS"),
     ):
         done = said(*arguments)
         assert done.returncode == 2

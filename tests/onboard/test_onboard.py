@@ -164,22 +164,26 @@ def test_choose_takes_the_best_candidate_that_has_a_value(programs, tmp_path):
     features = np.random.default_rng(0).normal(size=(50, 3, 2)).astype(np.float32)
     order = np.argsort(reward.value(features))
     features[order[-1], 1, 0] = np.nan
-    line = run(programs / "choose", path, input=features.tobytes()).decode()
+    may = np.ones(50, np.uint8)
+    may[order[-2]] = 0  # so its filter says
+    (tmp_path / "may").write_bytes(may.tobytes())
+    (tmp_path / "one").write_bytes(b"\1")
+    given = {"input": features.tobytes()}
+    line = run(programs / "choose", path, tmp_path / "may", **given).decode()
     found = re.fullmatch(r"candidate (\d+) of 50, value (\S+), 1 refused\n", line)
     assert found is not None
-    assert int(found[1]) == order[-2]
-    second = reward.value(features[order[-2]])
-    assert float(found[2]) == pytest.approx(float(second), abs=1e-5)
+    assert int(found[1]) == order[-3]
+    third = reward.value(features[order[-3]])
+    assert float(found[2]) == pytest.approx(float(third), abs=1e-5)
     with pytest.raises(WeightsError) as python:
         load_weights(missing)
     for file, data, message, code in (
         (path, features[:1].tobytes()[4:], "stdin: candidates: 5 numbers: expected", 2),
-        (path, np.full(6, np.nan, "f4").tobytes(), "stdin: candidates: all 1 ref", 1),
+        (path, np.full(6, np.nan, "f4").tobytes(), "stdin: candidates: none of 1 ", 1),
         (missing, b"", f"{python.value}\n", 2),
     ):
-        done = subprocess.run(
-            [programs / "choose", file], input=data, capture_output=True, check=False
-        )
+        command = [programs / "choose", file, tmp_path / "one"]
+        done = subprocess.run(command, input=data, capture_output=True, check=False)
         assert (done.returncode, done.stdout) == (code, b"")
         assert done.stderr.decode().startswith(message)
 

@@ -141,7 +141,7 @@ def choose(
     values, in_distribution, none = _values(reward, scene, columns, own, guard)
     admissible = reasons.reason == Reason.NONE
     why = tuple(_text(*row) for row in zip(*reasons, strict=True))
-    if not admissible.any():
+    if not none and not admissible.any():
         first = f": candidate 0 {why[0]}" if why else ""
         none = f"none of {len(why)} candidates is admissible{first}"
     best = None if none else int(np.argmax(np.where(admissible, values, -np.inf)))
