@@ -6,8 +6,8 @@ Builds `onboard/` twice, for any processor of this kind (-O3) and for this very 
 (-march=native), and times single calls 2 ms apart, as a planner makes them: wall time,
 and processor time, which other programs on the core do not stretch. Goals: scores
 alone have a p99 below 1 ms for 15 tanh units, features and scores together one below
-2 ms. Beside the latter, in the same run: the compiled JAX functions, and the numpy file
-for planners.
+2 ms, and so with the safety filter and the choice (`choose`). Beside the latter two,
+in the same run: the compiled JAX functions, and the numpy files for planners.
 """
 
 import dataclasses
@@ -24,6 +24,7 @@ from absl import app, flags
 from benchmarks.common import percentiles, write
 from rcirl_jax.export import Reward, save
 from rcirl_jax.export.own_planner.builder import plain_scene
+from rcirl_jax.export.own_planner.choose import choose
 from rcirl_jax.features import feature_map
 from rcirl_jax.types import Scene
 from tests.helpers import drawn_scenes, own_planner
@@ -31,7 +32,9 @@ from tests.helpers.scenes import random_scene
 from tests.helpers.weights_files import example_samples, example_weights
 
 _CALLS = flags.DEFINE_integer("calls", 2000, "calls that are timed")
-_PARTS = flags.DEFINE_list("parts", "scores,features", "what is timed, each a file")
+_PARTS = flags.DEFINE_list(
+    "parts", "scores,features,choose", "what is timed, each a file"
+)
 _BUILD = flags.DEFINE_string("build", "build", "folder of the two builds")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
 
@@ -109,23 +112,38 @@ def planning_frames() -> Iterator[tuple[Scene, np.ndarray, np.ndarray]]:
 
 def features(programs: dict[str, Path], folder: Path) -> dict:
     """Features and scores together, on crowded scenes."""
-    reward = own_planner.drawn_reward(folder / "reward", feature_map("paper21"))
+    return on_frames("features", programs, folder)
+
+
+def choice(programs: dict[str, Path], folder: Path) -> dict:
+    """The safety filter, features, scores and the choice, on the same scenes."""
+    return on_frames("choose", programs, folder)
+
+
+def on_frames(what: str, programs: dict[str, Path], folder: Path) -> dict:
+    """Times of what is done with each planning frame, by every form of it."""
+    columns = feature_map("paper21")
+    reward = own_planner.drawn_reward(folder / "reward", columns, mode="path_speed")
     frames, file = list(planning_frames()), folder / "cases"
     plain = [(plain_scene(scene), *ways) for scene, *ways in frames]
     np.concatenate([own_planner.as_numbers(*case) for case in plain]).tofile(file)
     rows = {
-        build: measured(path / "bench_features", reward.file, file)
+        build: measured(path / "bench_features", what, reward.file, file)
         for build, path in programs.items()
     }
-    rows["jax"] = here(jax_call(reward, frames), _CALLS.value)
-    numpy_call = lambda i: own_planner.numpy_answers(reward, *plain[i % SCENES])  # noqa: E731
-    rows["numpy"] = here(numpy_call, NUMPY_CALLS)
+    rows["jax"] = here(jax_call(what, reward, frames), _CALLS.value)
+    in_numpy = choose if what == "choose" else own_planner.numpy_answers
+    rows["numpy"] = here(lambda i: in_numpy(reward, *plain[i % SCENES]), NUMPY_CALLS)
     return rows
 
 
-def jax_call(reward: Reward, frames: list) -> Callable[[int], object]:
+def jax_call(what: str, reward: Reward, frames: list) -> Callable[[int], object]:
     """The same by compiled JAX, of scenes that lie on the device."""
-    score = own_planner.compiled_score(feature_map("paper21"), reward)
+    compiled = {
+        "features": own_planner.compiled_score,
+        "choose": own_planner.compiled_choice,
+    }
+    score = compiled[what](feature_map("paper21"), reward)
     given = [jax.tree.map(jax.numpy.asarray, frame) for frame in frames]
     return lambda i: jax.block_until_ready(score(*given[i % SCENES]))
 
@@ -147,7 +165,11 @@ def main(_: list[str]) -> None:
         "portable": built("onboard", "OFF"),
         "native": built("onboard_native", "ON"),
     }
-    parts = {"scores": ("onboard", scores), "features": ("onboard_features", features)}
+    parts = {
+        "scores": ("onboard", scores),
+        "features": ("onboard_features", features),
+        "choose": ("onboard_choose", choice),
+    }
     for part in _PARTS.value:
         name, timed_part = parts[part]
         with tempfile.TemporaryDirectory() as folder:

@@ -12,6 +12,7 @@ from rcirl_jax.export.loading import reward_params
 from rcirl_jax.export.own_planner import features as plain
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.planner.rank import learned_score
+from rcirl_jax.planner.safety import check, choose
 from rcirl_jax.sampling.kinematics import trajectory_from_positions, trajectory_on_path
 from rcirl_jax.types import Candidates
 from rcirl_jax.units import TIMES_S
@@ -100,6 +101,17 @@ def compiled_score(columns, reward):
     """A compiled function (scene, s, l [K, T]) -> values [K] of one planning frame."""
     score, params = learned_score(columns, reward.activation), reward_params(reward)
     return jax.jit(lambda scene, s, l: score(params, scene, candidates(scene, s, l)))
+
+
+def compiled_choice(columns, reward):
+    """A compiled function (scene, s, l [K, T]) -> index of the best admissible."""
+    score, params = learned_score(columns, reward.activation), reward_params(reward)
+
+    def of_one(scene, s, l):
+        given = candidates(scene, s, l)
+        return choose(check(scene, given), given, score(params, scene, given))
+
+    return jax.jit(of_one)
 
 
 def jax_answers(columns, reward, scenes, s, l=None):
