@@ -62,6 +62,11 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f"; did you mean {near[0]}?" if near else ""
 
 
+def counted(count: int, what: str) -> str:
+    """Returns a count with its noun: 1 recording, 2 recordings."""
+    return f"{count:,} {what}{'' if count == 1 else 's'}"
+
+
 @contextlib.contextmanager
 def as_input_error(what: str, expected: str) -> Iterator[None]:
     """Turns what libraries raise of bad data (`BAD_DATA`) into one line.

@@ -4,7 +4,10 @@ A module defines its flags with absl, which knows one flag of a name in a proces
 the module that is asked for is imported. This one imports neither absl nor JAX.
 """
 
+import contextlib
 import importlib
+import os
+import signal
 import sys
 
 from rcirl_jax import __version__
@@ -54,12 +57,13 @@ def overview() -> str:
 def main() -> None:
     """`rcirl SUB --flags`: import the module of SUB, and run its main."""
     name, *rest = sys.argv[1:] or ["--help"]
-    if name in HELP:
-        print(overview())
-        return
-    if name == "--version":
-        print(f"rcirl-jax {__version__}")
-        return
+    if name in HELP or name == "--version":
+        text = f"rcirl-jax {__version__}" if name == "--version" else overview()
+        with contextlib.suppress(BrokenPipeError):  # nobody reads on, behind `| head`
+            print(text, flush=True)
+            return
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(128 + signal.SIGPIPE)
     if name not in COMMANDS:
         hint = did_you_mean(name, COMMANDS)
         print(

@@ -42,7 +42,7 @@ from rcirl_jax.data.store.files import Files
 from rcirl_jax.data.store.rows import check_finite
 from rcirl_jax.data.store.splits import split_wholes, time_blocks
 from rcirl_jax.data.store.writer import DatasetWriter
-from rcirl_jax.errors import InputError, LostWorkError
+from rcirl_jax.errors import InputError, LostWorkError, counted
 from rcirl_jax.runtime.executors import Executor, Serial
 from rcirl_jax.types import Demonstration, Kind, Recording, Track
 
@@ -515,10 +515,9 @@ class _Import:
     def _said_of_streams(self) -> str:
         """Returns the end of a line on vehicles in several recordings."""
         said = ""
-        if count := len(self.driven_on):
-            said = (
-                f"; {count} vehicles drive on from one recording to the next: one each"
-            )
+        if self.driven_on:
+            again = counted(len(self.driven_on), "vehicle")
+            said = f"; {again} met again in the next recording: on one side"
         if len(self.without_clock) > 1:
             said += "; the logs say no time of day: files of one stream cannot be told"
         return said
@@ -582,9 +581,10 @@ class _Import:
             )
         if quality.scenes == 0:
             if quality.empty and not quality.recordings:
+                empty = counted(quality.empty, "recording")
                 raise InputError(
-                    f"import: {quality.empty} recordings, none with traffic: "
-                    "expected at least one road user"
+                    f"import: {empty}, none with traffic: expected at least one road "
+                    "user"
                 )
             why = remedies(quality.dropped) or "none was long enough"
             raise InputError(f"import: 0 scenes kept of {quality.tracks} tracks: {why}")

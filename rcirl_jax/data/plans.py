@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rcirl_jax.data.scenes.lanes import LaneGraph
+from rcirl_jax.errors import counted
 from rcirl_jax.types import Kind, Recording, Track
 
 MAX_TRACKS = 200  # of a recording, evenly
@@ -107,11 +108,10 @@ def facts_of(plan: Mapping[str, Any]) -> str:
     """Says what a plan shows in a line of words."""
     lanes = plan["lanes"]
     limits = sorted({x["limit"] or plan["default_limit"] for x in lanes})
-    words = [f"{plan['vehicles']:,} vehicles, {len(lanes):,} pieces of lane"]
+    words = [counted(plan["vehicles"], "vehicle"), f"{len(lanes):,} pieces of lane"]
     if lanes:
         apart = [x["left"] + x["right"] for x in lanes]
         words.append(f"{np.median(apart):.1f} m wide")
         words.append("limit " + ", ".join(f"{x:.0f}" for x in limits[:4]) + " m/s")
-    count = len(plan["changes"])
-    words.append(f"{count:,} change{'' if count == 1 else 's'} of lane")
+    words.append(f"{counted(len(plan['changes']), 'change')} of lane")
     return ", ".join(words)

@@ -12,6 +12,7 @@ from rcirl_jax.data.scenes.filters import REASONS, REMEDIES
 from rcirl_jax.data.scenes.lines import TOO_FEW
 from rcirl_jax.data.scenes.tracks import HARSH_MPS2, harsh_share, note_of
 from rcirl_jax.data.store.dataset import Dataset
+from rcirl_jax.errors import counted
 from rcirl_jax.types import Decision, Demonstration, Kind, Recording, RowCounts, Tag
 
 HEADWAY_STEP_S = 0.01  # s, to which headways are counted
@@ -281,9 +282,10 @@ def oddities(report: Mapping) -> list[str]:
             f"({dropped / rows['read']:.2%}): {why}"
         )
     if report.get("refused"):
-        lines.append(f"{report['refused']} recordings refused and left out")
+        lines.append(f"{counted(report['refused'], 'recording')} refused and left out")
     if report.get("empty"):
-        lines.append(f"{report['empty']} recordings without traffic skipped")
+        skipped = counted(report["empty"], "recording")
+        lines.append(f"{skipped} without traffic skipped")
     if report.get("assumed"):
         counts = report["assumed"]
         wholes = (LIMIT, "lanes"), (WIDTH, "lanes"), (SIZE, "road users")

@@ -204,15 +204,14 @@ class Stages:
 
 
 @contextlib.contextmanager
-def only_one(folder: Path, *, leave_nothing: bool = False) -> Iterator[None]:
+def only_one(folder: Path) -> Iterator[None]:
     """Holds a folder for this process; it is made if missing.
 
-    The lock goes with the process, however that ends; its file means nothing.
+    The lock goes with the process, however that ends; its file means nothing. At the
+    end it is removed, and so are folders made for it that are empty then.
 
     Args:
       folder: to hold.
-      leave_nothing: remove the lock's file at the end, and folders made for it that
-        are empty then.
 
     Raises:
       InputError: another process holds it.
@@ -229,8 +228,7 @@ def only_one(folder: Path, *, leave_nothing: bool = False) -> Iterator[None]:
         try:
             yield
         finally:
-            if leave_nothing:
-                path.unlink(missing_ok=True)
-                with contextlib.suppress(OSError):
-                    for one in made:
-                        one.rmdir()
+            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                for one in made:
+                    one.rmdir()

@@ -116,8 +116,12 @@ running.run(main)
 @pytest.mark.parametrize("joined", [False, True], ids=["stdout", "both"])
 @pytest.mark.parametrize(
     "words",
-    [["-m", "rcirl_jax", "train", "--helpfull"], ["-c", PRINTS]],
-    ids=["help", "main"],
+    [
+        ["-m", "rcirl_jax", "train", "--helpfull"],
+        ["-m", "rcirl_jax", "help"],
+        ["-c", PRINTS],
+    ],
+    ids=["help", "overview", "main"],
 )
 def test_output_that_nobody_reads_ends_without_a_word(words, joined):
     """As behind `| head`; what is written is more than a buffer holds."""

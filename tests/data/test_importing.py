@@ -89,9 +89,9 @@ def test_a_recording_without_traffic_is_counted_and_skipped(tmp_path, three):
     assert made.count == plain.count
     assert (made.quality["recordings"], made.quality["empty"]) == (3, 1)
     assert any(note == "empty: no traffic" for note in made.quality["notes"])
-    assert "1 recordings without traffic skipped" in format_quality(made.quality)
+    assert "1 recording without traffic skipped" in format_quality(made.quality)
     line = refused(import_logs, [empty], tmp_path / "none", CONFIG)
-    assert "1 recordings, none with traffic" in line
+    assert "1 recording, none with traffic" in line
     assert not (tmp_path / "none").exists()
 
 

@@ -158,13 +158,13 @@ def test_a_second_process_is_refused_and_a_killed_one_holds_nothing(tmp_path):
         assert (tmp_path / LOCK).exists()
 
 
-def test_a_lock_that_leaves_nothing(tmp_path):
+def test_a_lock_leaves_nothing(tmp_path):
     """Not even the folders made for it, unless something is in them."""
     deep = tmp_path / "a" / "b"
-    with only_one(deep, leave_nothing=True):
+    with only_one(deep):
         assert (deep / LOCK).exists()
     assert list(tmp_path.iterdir()) == []
-    with only_one(deep, leave_nothing=True):
+    with only_one(deep):
         (deep / "kept").write_text("x")
     assert [x.name for x in deep.iterdir()] == ["kept"]
 

@@ -36,7 +36,7 @@ from rcirl_jax.data.store.files import (
     unseal,
 )
 from rcirl_jax.data.store.rows import leaf_specs, row_spec
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, counted
 from rcirl_jax.runtime.atomic_files import parse_json, plain
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.types import Demonstration
@@ -254,11 +254,9 @@ class Dataset(Demonstrations):
 
     def __repr__(self) -> str:
         """Returns the folder, and how many scenes of how many recordings it has."""
-        recordings = len(self.manifest.recordings)
-        return (
-            f"Dataset({self._files.name}: {self.count:,} scenes of {recordings:,} "
-            f"recordings)"
-        )
+        scenes = counted(self.count, "scene")
+        recordings = counted(len(self.manifest.recordings), "recording")
+        return f"Dataset({self._files.name}: {scenes} of {recordings})"
 
     def __getitem__(self, row: int) -> Demonstration:
         """Returns one row; numpy leaves without the row's axis.

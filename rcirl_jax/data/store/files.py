@@ -64,7 +64,7 @@ class Files:
         """
         if self.folder is None:
             return contextlib.nullcontext()
-        return only_one(Path(self.folder), leave_nothing=True)
+        return only_one(Path(self.folder))
 
     def path(self, key: str) -> str:
         """Returns how messages call a key."""

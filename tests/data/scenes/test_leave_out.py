@@ -54,7 +54,7 @@ def test_one_scenario_of_a_file_is_left_out(tmp_path):
     assert "refused" not in plain.quality
     assert any("left out: " in note and "record 1" in note
                for note in made.quality["notes"])  # fmt: skip
-    assert "1 recordings refused and left out" in format_quality(made.quality)
+    assert "1 recording refused and left out" in format_quality(made.quality)
     assert made.sources == plain.sources
     assert made.rate_hz == plain.rate_hz
     assert made.import_flags["leave_out"] == 1
@@ -114,7 +114,7 @@ def test_the_command(tmp_path):
     flags = (*flags, "--leave_out=1", "--signals=pooled")  # which reads the logs too
     done = commands.command("rcirl_jax", "import", *flags)
     assert done.returncode == 0, done.stderr[-2000:]
-    assert "1 recordings refused and left out" in done.stdout
+    assert "1 recording refused and left out" in done.stdout
     dataset = open_dataset(tmp_path / "data")
     facts = dataset.facts()
     assert facts["data_hash"] == dataset.hash
