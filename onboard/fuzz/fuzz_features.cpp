@@ -1,4 +1,4 @@
-// libFuzzer target: a scene and candidates of any bits give features without harm.
+// libFuzzer target: a scene and candidates of any bits give features and rulings without harm.
 //
 // The first byte chooses how numbers are read: 0 as they are, 1 folded into a range that
 // roads have, so that scenes pass the check. The second is the number of obstacles.
@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "bits.hpp"
+#include "rcirl/choose.hpp"
 #include "rcirl/features.hpp"
 
 namespace {
@@ -93,6 +94,24 @@ void check_row(const float* row) {
   require((row[d::kCollision] == 1.0f) == (row[d::kCollisionDistance] < 0.0f));
 }
 
+// A ruling for each candidate, with an obstacle and a time that are there.
+void check_rulings(const rcirl::Scene& made, const rcirl::Candidates& candidates, bool fine) {
+  std::vector<rcirl::Ruling> rulings(candidates.count);
+  const std::size_t admissible = rcirl::admit(made, candidates, {}, rulings.data());
+  std::size_t count = 0;
+  for (const rcirl::Ruling& ruling : rulings) {
+    count += ruling.admissible();
+    require(ruling.admissible() == text(ruling).empty());
+    require(fine || ruling.reason == rcirl::Reason::kNoNumber);
+    const bool named = ruling.obstacle != rcirl::Ruling::kNobody;
+    require(!named || ruling.obstacle < made.obstacles.size());
+    require(!std::isfinite(ruling.time) || (ruling.time >= 0.0f && ruling.time <= 8.0f));
+  }
+  require(count == admissible);
+  rcirl::Chooser none;
+  require(!none.choose(made, candidates).found() && !none.why().empty());
+}
+
 }  // namespace
 
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
@@ -127,6 +146,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
       }
     }
     require(unknown == refused);
+    check_rulings(made, {s.data(), offsets, kCount}, status.ok());
     require(status.ok() ? !bits.folded || refused == 0 : refused == kCount);
   }
   return 0;

@@ -116,6 +116,13 @@ def test_offsets_that_differ_are_refused_where_l_was_not_trained(likes_speed):
     assert choose(both, road(**EDGES), s, l).best is not None
 
 
+def test_candidates_begin_where_the_ego_is(likes_speed):
+    with pytest.raises(FeatureError) as caught:
+        choose(likes_speed, road(), holding() + 7.0)
+    line = "scene: candidates.s[0, 0]: 7.00 m: expected the ego's place, 0.00 m"
+    assert str(caught.value) == line
+
+
 def test_another_grid_of_times_is_refused(likes_speed):
     late = dataclasses.replace(likes_speed, times=2.0 * likes_speed.times)
     with pytest.raises(FeatureError, match=r"times: another grid: expected 8 i / 17 s"):
@@ -229,6 +236,8 @@ def test_what_python_refuses_cpp_refuses_with_the_same_line(reader, rewards, tmp
     for name, case in (
         ("speed", (wide, s, l)),
         ("prior", (wide, s, None)),
+        ("lateral", (wide, s + 12.0 * (np.arange(10) == 3)[:, None], None)),
+        ("lateral", (wide, s, l + 2.0)),
         ("lateral", (unknown, s, l)),
     ):
         ((best, none, values, _),) = in_cpp(reader, tmp_path, rewards[name], [case])

@@ -16,6 +16,7 @@
 #define RCIRL_CHOOSE_HPP_
 
 #include <algorithm>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstdio>
@@ -45,6 +46,7 @@ enum class Outcome : std::uint8_t {
   kNoneAdmissible,     // no admissible candidate has a value
   kOutOfDistribution,  // so the guard says, and there are no own values
   kNoOwn,              // the reward has a prior cost, and there are no own values
+  kElsewhere,          // a candidate begins elsewhere than the ego
   kApart,              // offsets differ, and the reward was trained along one path
   kBadScene,           // `check` refuses it
   kNoRoad,             // offsets, in a scene without the road's edges
@@ -62,6 +64,27 @@ struct Choice {
 namespace detail {
 
 constexpr float kApartM = 0.25f;  // m beside each other from which candidates differ in l
+
+constexpr float kAtEgoM = 1.0f;   // m from the ego within which candidates have to begin
+
+// Where a candidate begins that does not begin where the ego is; whether there is one.
+struct Elsewhere {
+  bool found = false, lateral = false;
+  std::size_t candidate = 0;
+  float at = 0.0f, ego = 0.0f;  // m
+};
+
+inline Elsewhere begins_elsewhere(const Ego& ego, const Candidates& candidates) {
+  for (const bool lateral : {false, true}) {
+    const float* places = lateral ? candidates.l : candidates.s;
+    const float here = lateral ? ego.l : ego.s;
+    for (std::size_t k = 0; places != nullptr && k < candidates.count; ++k) {
+      const float first = places[k * kTimes];
+      if (std::abs(first - here) > kAtEgoM) return {true, lateral, k, first, here};
+    }
+  }
+  return {};
+}
 
 // The two candidates furthest apart in offsets from the path, and when.
 struct Apart {
@@ -136,6 +159,7 @@ class Chooser {
   Choice choice_;
   Verdict verdict_;
   detail::Apart apart_;
+  detail::Elsewhere elsewhere_;
 };
 
 // A chooser for a reward, which it copies; or why there is none. A failure leaves `made` as
@@ -181,6 +205,12 @@ inline Outcome Chooser::judge(const Scene& scene, const Candidates& candidates,
   const Reason reason = detail::judgeable(scene, candidates);
   if (reason == Reason::kNoNumber) return Outcome::kBadScene;
   if (reason == Reason::kNoRoad) return Outcome::kNoRoad;
+  elsewhere_ = detail::begins_elsewhere(scene.ego, candidates);
+  if (elsewhere_.found) return Outcome::kElsewhere;
+  if (candidates.l != nullptr && reward_.mode() == "speed") {
+    apart_ = detail::furthest_apart(scene.path, candidates);
+    if (apart_.metres > detail::kApartM) return Outcome::kApart;
+  }
   const std::size_t row = kTimes * columns_.size();
   if (features_.size() < candidates.count * row) features_.resize(candidates.count * row);
   const std::uint8_t* feasible = candidates.feasible;
@@ -191,10 +221,6 @@ inline Outcome Chooser::judge(const Scene& scene, const Candidates& candidates,
         columns_.write(scene, lanes, x, known, &features_[first * row]);
         detail::judge(scene, options_.safety, lanes, x, known, may, &rulings_[first]);
       });
-  if (candidates.l != nullptr && reward_.mode() == "speed") {
-    apart_ = detail::furthest_apart(scene.path, candidates);
-    if (apart_.metres > detail::kApartM) return Outcome::kApart;
-  }
   return value(scene, candidates.count, own);
 }
 
@@ -233,6 +259,11 @@ inline std::string Chooser::why() const {
              reward_.features()[verdict_.feature].name + ": no own values to choose by";
     case Outcome::kNoOwn:
       return reward_.file() + ": own: None: expected own values, for it has a prior cost";
+    case Outcome::kElsewhere:
+      std::snprintf(line, sizeof line, "[%zu, 0]: %.2f m: expected the ego's place, %.2f m",
+                    elsewhere_.candidate, static_cast<double>(elsewhere_.at),
+                    static_cast<double>(elsewhere_.ego));
+      return std::string("scene: candidates.") + (elsewhere_.lateral ? "l" : "s") + line;
     case Outcome::kApart:
       std::snprintf(line, sizeof line, "%zu and %zu are %.2f m apart at %.2f s", apart_.left,
                     apart_.right, static_cast<double>(apart_.metres),

@@ -32,6 +32,7 @@ Array = np.ndarray
 Reason, TIMES_S = rules.Reason, features.TIMES_S
 USUAL = rules.SafetyConfig()
 APART_M = 0.25  # m beside each other at one time, from which candidates differ in l
+AT_EGO_M = 1.0  # m from the ego within which candidates have to begin
 SAME_TIMES_S = 1e-4  # s
 TEXTS = {
     Reason.NONE: "",
@@ -82,18 +83,27 @@ def admit(
     Raises:
       FeatureError: a number is missing, not finite or out of range.
     """
-    plain, point, _ = features.driven(scene, s, l)
-    if l is not None and (
-        scene.path.road_left is None or scene.path.road_right is None
-    ):
+    given = features.driven(scene, s, l)
+    _check_edges(scene, l)
+    return _rulings(given, feasible, safety)
+
+
+def _check_edges(scene: features.Scene, l: Array | None) -> None:
+    edges = (scene.path.road_left, scene.path.road_right)
+    if l is not None and any(edge is None for edge in edges):
         _fail("scene: path.road_left, path.road_right", None, "edges, for candidates.l")
-    count = len(point.s)
+
+
+def _rulings(
+    given: features.Driven, feasible: Array | None, safety: rules.SafetyConfig
+) -> rules.Explanation:
+    count = len(given.motion.s)
     may = np.ones(count, bool) if feasible is None else np.asarray(feasible)
     if may.shape != (count,) or may.dtype != bool:
         _fail("feasible", f"{may.dtype} {may.shape}", f"bool ({count},)")
     with np.errstate(over="ignore", invalid="ignore"):
-        given = SimpleNamespace(trajectory=point, feasible=may)
-        return rules.explain(plain, given, safety)
+        candidates = SimpleNamespace(trajectory=given.motion, feasible=may)
+        return rules.explain(given.scene, candidates, safety)
 
 
 def choose(
@@ -128,16 +138,20 @@ def choose(
 
     Raises:
       FeatureError: numbers that are missing, not finite or out of range; another time
-        grid; offsets that differ, for weights trained along one path (`mode`); a prior
-        cost without own values, or with a guard.
+        grid; candidates that begin elsewhere than the ego; offsets that differ, for
+        weights trained along one path (`mode`); a prior cost without own values, or
+        with a guard.
     """
     times = np.asarray(reward.times)
     if times.shape != TIMES_S.shape or np.abs(times - TIMES_S).max() > SAME_TIMES_S:
         _fail(f"{reward.file}: times", "another grid", "8 i / 17 s, i = 0 .. 17")
-    reasons = admit(scene, s, l, feasible, safety)
+    given = features.driven(scene, s, l)
+    _check_edges(scene, l)
+    _check_start(given, ("s",) if l is None else ("s", "l"))
     if l is not None and reward.mode == "speed":
-        _check_alike(reward, scene, s, l)
-    columns = features.FeatureMap(reward.names, reward.units)(scene, s, l)
+        _check_alike(reward.file, given)
+    reasons = _rulings(given, feasible, safety)
+    columns = features.FeatureMap(reward.names, reward.units).of(given)
     values, in_distribution, none = _values(reward, scene, columns, own, guard)
     admissible = reasons.reason == Reason.NONE
     why = tuple(_text(*row) for row in zip(*reasons, strict=True))
@@ -187,10 +201,18 @@ def _values(
     return values, False, f"out of distribution: {far}: no own values to choose by"
 
 
-def _check_alike(reward: Any, scene: features.Scene, s: Array, l: Array) -> None:  # noqa: ANN401
+def _check_start(given: features.Driven, axes: tuple[str, ...]) -> None:
+    """Refuse candidates that begin elsewhere than the ego."""
+    for axis in axes:
+        first, ego = getattr(given.motion, axis)[:, 0], getattr(given.scene.ego, axis)
+        for k in np.flatnonzero(np.abs(first - ego) > AT_EGO_M)[:1]:
+            expected = f"the ego's place, {ego:.2f} m"
+            _fail(f"scene: candidates.{axis}[{k}, 0]", f"{first[k]:.2f} m", expected)
+
+
+def _check_alike(file: str, given: features.Driven) -> None:
     """Refuse offsets from the path that differ between candidates at one time."""
-    _, point, view = features.driven(scene, s, l)
-    aside = point.l - view.l
+    aside = given.motion.l - given.path.l
     if not len(aside):
         return
     apart = np.ptp(aside, axis=0)
@@ -200,7 +222,7 @@ def _check_alike(reward: Any, scene: features.Scene, s: Array, l: Array) -> None
         _fail(
             "scene: candidates.l",
             f"{left} and {right} are {apart[t]:.2f} m apart at {TIMES_S[t]:.2f} s",
-            f"no offsets, or equal ones: l was not trained ({reward.file}: mode=speed)",
+            f"no offsets, or equal ones: l was not trained ({file}: mode=speed)",
         )
 
 

@@ -22,7 +22,7 @@ points of the station grid, `K` candidates, `F` features.
 import dataclasses
 from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -191,19 +191,21 @@ def _fail(field: str, value: object, expected: str) -> NoReturn:
     raise FeatureError(f"scene: {field}: {str(value)[:80]}: expected {expected}")
 
 
-def driven(
-    scene: Scene, s: Array, l: Array | None = None
-) -> tuple[Any, Any, f.PathView]:
-    """Return a scene in arrays, the motion of its candidates, and the path under them.
+class Driven(NamedTuple):
+    """Candidates in their scene, checked."""
+
+    scene: Any  # leaves as in `rcirl_jax.types`; of obstacles at least one, maybe empty
+    motion: Any  # leaves s, v, a, j, l, dl, ddl [K, T]
+    path: f.PathView  # at the candidates' stations [K, T]
+
+
+def driven(scene: Scene, s: Array, l: Array | None = None) -> Driven:
+    """Return candidates with their derivatives, in a scene of arrays.
 
     Args:
       scene: one planning frame.
       s: [K, T] m, stations at `TIMES_S`.
       l: [K, T] m, lateral offsets; None: all drive along the given path.
-
-    Returns:
-      The scene with leaves as in `rcirl_jax.types`, of obstacles at least one, which
-      may be empty; a motion with leaves s, v, a, j, l, dl, ddl [K, T]; the path at s.
 
     Raises:
       FeatureError: a number is missing, not finite or out of range.
@@ -227,7 +229,8 @@ def driven(
             dl, ddl = (np.where(f.FIRST, first, rest) for first, rest in given)
         else:
             dl, ddl = f.lateral_derivatives(s, l, ego.dl, ego.ddl)
-    return plain, SimpleNamespace(s=s, v=v, a=a, j=j, l=l, dl=dl, ddl=ddl), view
+    motion = SimpleNamespace(s=s, v=v, a=a, j=j, l=l, dl=dl, ddl=ddl)
+    return Driven(plain, motion, view)
 
 
 class FeatureMap:
@@ -254,7 +257,11 @@ class FeatureMap:
         Raises:
           FeatureError: a number is missing, not finite or out of range.
         """
-        plain, point, view = driven(scene, s, l)
+        return self.of(driven(scene, s, l))
+
+    def of(self, given: Driven) -> Array:
+        """Return F of candidates, float32 [K, T, F]."""
+        plain, point, view = given
         s = point.s
         with np.errstate(over="ignore", invalid="ignore"):
             start = np.full_like(s[:, :1], -f.BEFORE_M)
