@@ -25,6 +25,8 @@ import enum
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import numpy as np
+
 try:
     from rcirl_jax.errors import InputError
     from rcirl_jax.features.columns import namespace, path_view
@@ -295,6 +297,9 @@ def _touches(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
     moves = (xp.abs(speed[:, 0]) > MOVING_MPS) & (obstacles.kind != Kind.STATIC)
     starts = TIMES_S[:-1, None]
     for n in range(obstacles.kind.shape[0]):
+        if xp is np and not known[n].any():  # XLA cannot see it, numpy can
+            yield np.zeros(x.s[:-1].shape, bool)
+            continue
         low_s, high_s = obstacles.s_lower[n][:, None], obstacles.s_upper[n][:, None]
         low_l, high_l = obstacles.l_lower[n][:, None], obstacles.l_upper[n][:, None]
         size_s, size_l = 0.5 * (high_s - low_s), 0.5 * (high_l - low_l)
