@@ -119,7 +119,8 @@ def parts(
         name_of = getattr(module, "own_name", None)
         if name_of is not None:
             spec = with_log_names(input_path, found, spec, name_of)
-        spec = {**spec, BESIDE: beside(found)}
+        if len(found) > 1:
+            spec = {**spec, BESIDE: beside(found)}
     for path in found:
         if not is_text(str(path)):
             raise InputError(f"{path}: name: {path.name!a}: expected UTF-8; rename it")
