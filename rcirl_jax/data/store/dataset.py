@@ -13,6 +13,7 @@ are those of `files.py`.
 import abc
 import functools
 import hashlib
+import importlib
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -36,7 +37,7 @@ from rcirl_jax.data.store.files import (
     unseal,
 )
 from rcirl_jax.data.store.rows import leaf_specs, row_spec
-from rcirl_jax.errors import InputError, counted
+from rcirl_jax.errors import InputError, counted, extra_module
 from rcirl_jax.runtime.atomic_files import parse_json, plain
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.types import Demonstration
@@ -323,6 +324,32 @@ class Dataset(Demonstrations):
         if not isinstance(found, list) or not all(isinstance(x, dict) for x in found):
             raise InputError(f"{name}: expected a list of objects")
         return found
+
+    def plot(self, site: int = 0) -> str:
+        """Draws the plan of a site: lanes, and where and how fast people drove.
+
+        Args:
+          site: number of the recording, of the first few that have plans.
+
+        Returns:
+          The text of an SVG, which a notebook shows.
+
+        Raises:
+          InputError: there is no such plan, or no matplotlib.
+
+        Examples:
+            >>> rcirl_jax.open_dataset("data").plot()[:4]
+            '<svg'
+        """
+        plans = self.plans()
+        if not 0 <= site < len(plans):
+            raise InputError(
+                f"site: {site}: expected a number below {len(plans)}, of the plans in "
+                f"{self._files.name}"
+            )
+        extra_module("matplotlib", "report")
+        drawing = importlib.import_module("rcirl_jax.data.drawing")
+        return drawing.site_svg(plans[site])
 
     def _arrays(self, shard: int) -> dict[str, ts.TensorStore]:
         """Returns the shard's arrays, opened once, of the shapes promised."""

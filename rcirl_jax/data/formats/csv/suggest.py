@@ -77,6 +77,7 @@ INSTEAD = {
 NEVER_KNOWN = (
     "speed_limit: 29.06 m/s (65 mph) until you say better",
     "reference_point: the centre of the box is assumed",
+    'y: counts to the left of x; where it counts downwards as in pictures: y = "-NAME"',
     "source, licence: yours to fill in",
 )
 
