@@ -190,6 +190,7 @@ def test_stamped_rows_may_come_in_any_order(tmp_path, writer):
     names = [f"{car}{piece}" for car in "123" for piece in ("", "#2", "#3", "#4")]
     assert [track.id for track in whole.tracks] == names
     assert whole.tracks[2].t[0] == 3600.0
+    assert whole.start_s == pytest.approx(1e-3 * min(row[3] for row in rows))
 
 
 ROWS = w.ngsim_rows()
