@@ -1,5 +1,6 @@
 """Ranks, drives and judges trained rewards, or goes through the whole loop."""
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +19,7 @@ from rcirl_jax.evaluation.closed_loop.summary import format_suite
 from rcirl_jax.evaluation.gate.types import GateConfig, Verdict
 from rcirl_jax.evaluation.gate.verdict import write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
-from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
+from rcirl_jax.evaluation.ranking.evaluate import evaluate_ranking
 from rcirl_jax.evaluation.ranking.report import RankingReport, format_table
 from rcirl_jax.export.closed_loop import SuiteJob, gate_job, judged, run_job
 from rcirl_jax.export.loading import load_runs, open_reward
@@ -69,13 +70,9 @@ def rank(
     """
     if not 0.0 < horizon_s <= 8.0:
         raise InputError(f"horizon_s: {horizon_s}: expected above 0, at most 8 s")
-    learned, preset, sampler = load_runs(_files(weights))
-    setup = RankingSetup(
-        preset=preset,
-        sampler=sampler,
-        horizon_s=horizon_s,
-        split=split,
-        drop_collisions=drop_collisions,
+    learned, setup = load_runs(_files(weights))
+    setup = dataclasses.replace(
+        setup, horizon_s=horizon_s, split=split, drop_collisions=drop_collisions
     )
     dataset = open_dataset(data) if isinstance(data, str | os.PathLike) else data
     return evaluate_ranking(dataset, learned, setup, executor)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.export.closed_loop import score_of
-from rcirl_jax.export.loading import features_of, reward_params
+from rcirl_jax.export.loading import features_of, own_cost_of, reward_params
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.responses import Response, prices, responses
 from rcirl_jax.features import feature_map
@@ -148,7 +148,7 @@ def score_candidates(
     """Value candidates as a planner that drives by a reward does.
 
     Args:
-      reward: of `load_weights`; one with a prior cost is added to the hand-set cost.
+      reward: of `load_weights`; one with a prior cost is added to that cost.
       scene: one scene, as the planner sees it (`with_predicted_futures`, `scene_from`).
       candidates: K of them, sampled or your own.
 
@@ -175,7 +175,7 @@ def score_candidates(
         score = learned_score(features_of(reward), reward.activation)
         return np.array(_score(reward_params(reward), scene, candidates, score))
     features_of(reward)
-    score, params = score_of(reward)
+    score, params = score_of(reward, own_cost_of([reward]))
     return np.array(_score(params, scene, candidates, score))
 
 

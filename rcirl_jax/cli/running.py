@@ -25,6 +25,7 @@ from absl import app, flags, logging
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError, did_you_mean, extra_of
 from rcirl_jax.export.reader import load_weights
+from rcirl_jax.planner import own_cost
 from rcirl_jax.runtime import provenance as made_by
 from rcirl_jax.runtime import signals as interrupts
 from rcirl_jax.runtime.atomic_files import is_text
@@ -84,6 +85,8 @@ def run(main: Callable[[], None]) -> None:
         except OSError as error:
             _refuse(_about(error))
         except (MemoryError, jax.errors.JaxRuntimeError) as error:
+            if line := own_cost.failure(error):
+                _refuse(line)
             why = " ".join(str(error).split())[:200]
             if not isinstance(error, MemoryError) and not why.startswith(NO_MEMORY):
                 _fault(error)

@@ -42,6 +42,7 @@ from rcirl_jax.evaluation.gate.verdict import judge, repeats
 from rcirl_jax.export.loading import (
     familiarity_of,
     open_reward,
+    own_cost_of,
     reward_params,
     row_names,
 )
@@ -49,7 +50,14 @@ from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm, Yielding
 from rcirl_jax.planner.dp import DpConfig, dp_policy
+from rcirl_jax.planner.own_cost import (
+    OwnCost,
+    check_own_cost,
+    is_place,
+    own_cost,
+)
 from rcirl_jax.planner.rank import (
+    ONLINE,
     Params,
     RankConfig,
     Ranking,
@@ -63,10 +71,11 @@ from rcirl_jax.planner.safety import SafetyConfig
 from rcirl_jax.runtime.atomic_files import read_json, write_json
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.runtime.executors import Executor
+from rcirl_jax.sampling import sample
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.simulation.recorded import held_out
-from rcirl_jax.simulation.rollout import LANES
+from rcirl_jax.simulation.rollout import LANES, first_scenes
 from rcirl_jax.simulation.rows import (
     BASELINES,
     Row,
@@ -78,6 +87,7 @@ from rcirl_jax.simulation.suite import (
     FULL_S,
     CaseRef,
     CaseSet,
+    build,
     case_duration,
     catalogue_set,
     drive_row,
@@ -93,29 +103,43 @@ _IDM = msgspec.defstruct(
 )
 
 
-def score_of(reward: Reward) -> tuple[Score, Ranking]:
-    """Returns the score of a weights file: V, or its prior cost and V."""
-    score = ranking_score(feature_map(str(reward.preset)), reward.activation)
+def score_of(reward: Reward, own: OwnCost | None = None) -> tuple[Score, Ranking]:
+    """Returns the score of a weights file: V, or its prior cost and V.
+
+    Args:
+      reward: the file's.
+      own: the user's own cost, where other rows or the file's prior cost are of it.
+
+    Raises:
+      InputError: its prior cost is another than `own` and the embedded ones.
+    """
+    score = ranking_score(feature_map(str(reward.preset)), reward.activation, own)
     prior_cost = reward.prior_cost
     if prior_cost is None:
         return score, ranking(reward_params(reward))
-    if prior_cost.incumbent != "hand-set":
+    known = ["hand-set", *([own.name] if own else [])]
+    if prior_cost.incumbent not in known:
         raise InputError(
             f"{reward.file}: prior_cost.incumbent: {prior_cost.incumbent}: expected "
-            "hand-set, whose cost is known here"
+            f"{' or '.join(known)}, whose cost is known here"
         )
     gains = prior_cost.low, prior_cost.high
-    known = familiarity_of(prior_cost)
-    return score, ranking(reward_params(reward), prior_cost.incumbent, gains, known)
+    familiar = familiarity_of(prior_cost)
+    return score, ranking(reward_params(reward), prior_cost.incumbent, gains, familiar)
 
 
-def incumbent_score(name: str) -> tuple[Score, Params]:
-    """The score of "hand-set" or of a weights file, and its weights.
+def incumbent_score(name: str, own: OwnCost | None = None) -> tuple[Score, Params]:
+    """The score of "hand-set", of an own cost or of a weights file, and its weights.
 
     Raises:
-      InputError: neither.
+      InputError: none of them.
     """
-    return (hand_score, None) if name == "hand-set" else score_of(open_reward(name))
+    if name == "hand-set":
+        return hand_score, None
+    if own is not None and name == own.name:
+        return own.score, None
+    reward = open_reward(name)
+    return score_of(reward, own_cost_of([reward]))
 
 
 def table_rows(
@@ -127,12 +151,13 @@ def table_rows(
     tuned_idm: Idm | None = None,
     names: Sequence[str] = (),
     track: str = "full",
+    own: str = "",
 ) -> list[Row]:
     """Learned rows first, in the order of the files, then the baselines.
 
     Rows are named as by `row_names`, or bear `names`, one per file. The first drives
     again by `dp`. A tuned IDM comes last. `track` is the safety filter's
-    (`SafetyConfig`).
+    (`SafetyConfig`), `own` the place of the user's own cost, a baseline by its name.
 
     Raises:
       InputError: no file, an unreadable one, one twice without `names`, path_speed
@@ -140,8 +165,9 @@ def table_rows(
     """
     if not weights:
         raise InputError("weights: none: expected at least one file")
-    config = RankConfig(safety=SafetyConfig(track=track))
     rewards = [open_reward(path) for path in weights]
+    user = own_cost_of(rewards, own)
+    config = RankConfig(safety=SafetyConfig(track=track), own=user)
     rows = _learned_rows(rewards, names, config)
     first = rewards[0]
     preset, params = str(first.preset), reward_params(first)
@@ -176,7 +202,7 @@ def _learned_rows(
                 f"{reward.file}: mode: {mode}: the closed loop plans speed"
             )
         seed = int(reward.provenance.get("seed") or 0)
-        score, params = score_of(reward)
+        score, params = score_of(reward, config.own)
         policy = rank_policy(score, config)
         rows.append(Row(name=name, policy=policy, params=params, seed=seed))
     return rows
@@ -195,6 +221,7 @@ class SuiteJob:
     names: tuple[str, ...] = ()  # of the learned rows; else after loss and shape
     tuned_idm: Idm | None = None  # of a further row
     track: str = "full"  # of the safety filter
+    own: str = ""  # place of the user's own cost
 
     def rows(self) -> list[Row]:
         """Learned rows, then the baselines."""
@@ -206,6 +233,7 @@ class SuiteJob:
             names=self.names,
             track=self.track,
             tuned_idm=self.tuned_idm,
+            own=self.own,
         )
 
     def cases(self) -> CaseSet:
@@ -297,7 +325,8 @@ def gate_job(
 
     Args:
       candidate: weights file.
-      incumbent: weights file, or the name of a baseline.
+      incumbent: weights file, name of a baseline, or place of an own cost
+        (`planner.own_cost`).
       suite: full, smoke, or families with commas.
       cases: per family; None: as declared.
       duration_s: of a case; None: 120 s, smoke 20 s.
@@ -310,12 +339,15 @@ def gate_job(
     Raises:
       InputError: a duration, suite or count that cannot be.
     """
-    learned = incumbent not in BASELINES
-    duration = case_duration(suite, duration_s)
+    duration, own = case_duration(suite, duration_s), ""
+    if is_place(incumbent):
+        own = incumbent
+        incumbent = checked_own_cost(own).name
+    learned = not own and incumbent not in BASELINES
     if learned and not Path(incumbent).is_file():
         raise InputError(
-            f"incumbent: {incumbent}: expected a weights file or one of "
-            + ", ".join(BASELINES)
+            f"incumbent: {incumbent}: expected a weights file, FILE.py:FUNCTION or "
+            f"FILE.so of an own cost, or one of {', '.join(BASELINES)}"
         )
     names = [*baselines] if learned else [incumbent, *baselines]
     files = {CANDIDATE: candidate, **({INCUMBENT: incumbent} if learned else {})}
@@ -328,8 +360,29 @@ def gate_job(
         plan_every=plan_every,
         tuned_idm=tuned_idm,
         track=track,
+        own=own,
     )
     return job, INCUMBENT if learned else incumbent
+
+
+CHECKED_PER_FAMILY = 10  # scenes of a family that an own cost is asked about
+
+
+@functools.cache
+def checked_own_cost(place: str) -> OwnCost:
+    """The own cost at a place, asked about the first scenes of the catalogue.
+
+    Raises:
+      InputError: there is none, or no planner could rank by it (`check_own_cost`).
+    """
+    cost = own_cost(place)
+    cases = build(suite_refs("full", CHECKED_PER_FAMILY, seed=1), 1.0)
+    scenes = first_scenes(cases)
+    keys = jax.random.split(jax.random.key(0), len(cases.steps))
+    draw = jax.jit(jax.vmap(lambda key, scene: sample(key, scene, ONLINE)))
+    candidates = draw(keys, scenes)
+    check_own_cost(cost, scenes, candidates, BASELINES)
+    return cost
 
 
 def drive_job(job: SuiteJob, executor: Executor) -> SuiteResult:
@@ -376,7 +429,7 @@ def judged(
     result, report = drive_job(job, executor), None
     if sources:
         recorded = held_out(sources, drives)
-        report = held_out_likeness(recorded, job.rows(), job.plan_every)
+        report = held_out_likeness(recorded, job.rows(), job.plan_every, incumbent)
     known = None if report is None else report.likeness
     pair = Pair(runs=result, name=incumbent, likeness=known)
     verdict = judge(pair, config, left_out(job))

@@ -1,6 +1,7 @@
 """A training run -> weights.msgpack with verification samples."""
 
 import datetime
+import os
 from pathlib import Path
 
 import jax
@@ -12,6 +13,7 @@ from rcirl_jax.errors import MALFORMED, InputError
 from rcirl_jax.export.reader import PriorCost, Reward
 from rcirl_jax.export.weights import save
 from rcirl_jax.features import feature_map
+from rcirl_jax.planner.own_cost import OwnCost
 from rcirl_jax.reward import (
     Normaliser,
     RewardModel,
@@ -78,6 +80,7 @@ def export_run(
     output: Path,
     *,
     prior_cost: PriorCost | None = None,
+    own: OwnCost | None = None,
 ) -> Reward:
     """Write weights.msgpack from a run's newest checkpoint.
 
@@ -89,6 +92,7 @@ def export_run(
       dataset: the dataset of the run (its hash has to match).
       output: file to write, atomically.
       prior_cost: of a reward driven on top of an incumbent.
+      own: the user's own cost, if that is the incumbent.
 
     Raises:
       InputError: no run, no checkpoint, another dataset, or another network than
@@ -118,6 +122,9 @@ def export_run(
         "mode": config.sampler.mode,
         "config": run["config"],
     }
+    if own is not None:
+        place = os.path.abspath(own.place)
+        provenance["own_cost"] = {"place": place, "sha256": own.sha256}
     return write_weights(
         output,
         state.params,

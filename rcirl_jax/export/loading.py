@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.ranking.score import PriorCostScorer
+from rcirl_jax.evaluation.ranking.score import PriorCostScorer, RankingSetup
 from rcirl_jax.export.reader import (
     FAMILIARITY,
     RANGES,
@@ -21,6 +21,7 @@ from rcirl_jax.export.reader import (
     load_weights,
 )
 from rcirl_jax.features.mapping import FeatureMap, feature_map, known_presets
+from rcirl_jax.planner.own_cost import OwnCost, own_cost
 from rcirl_jax.reward import effective_model, value
 from rcirl_jax.reward.familiarity import Familiarity
 from rcirl_jax.reward.network import LEAKY_SLOPE, point_of
@@ -34,6 +35,7 @@ _SAID: dict[str, type] = {
     **dict.fromkeys(("seed", "steps"), int),
     **dict.fromkeys(("git_commit", "dataset_sha256", "created", "mode"), str),
     **dict.fromkeys(("flags", "metrics", "versions", "config", "sweep"), dict),
+    "own_cost": dict,
 }
 
 
@@ -122,6 +124,37 @@ def scorer_of(reward: Reward) -> Scorer | PriorCostScorer:
     if reward.prior_cost is None:
         return reward.value
     return PriorCostScorer(incumbent=reward.prior_cost.incumbent, total=reward.total)
+
+
+def own_cost_of(rewards: Sequence[Reward], place: str = "") -> OwnCost | None:
+    """Return the user's own cost that rewards are added to, or that of a place.
+
+    Args:
+      rewards: each names in its provenance where its own cost was.
+      place: of an own cost that drives besides; "" for none.
+
+    Raises:
+      InputError: two own costs; one that is not where it was, or has changed.
+    """
+    found = {place: own_cost(place)} if place else {}
+    for reward in rewards:
+        was = reward.provenance.get("own_cost")
+        if reward.prior_cost is None or not was:
+            continue
+        if found and next(iter(found.values())).sha256 == was["sha256"]:
+            continue  # the same, elsewhere
+        made = own_cost(was["place"])
+        if made.sha256 != was["sha256"]:
+            raise InputError(
+                f"{reward.file}: own cost {was['place']}: it is no longer the one that "
+                "the reward was tuned on: expected the same file, or a new tuning"
+            )
+        found[made.place] = made
+    if len(found) > 1:
+        raise InputError(
+            f"own cost: {', '.join(found)}: expected one for all rows of a table"
+        )
+    return next(iter(found.values()), None)
 
 
 def compiled_scorer(reward: Reward) -> Scorer:
@@ -228,8 +261,8 @@ def prior_cost_words(name: str, reward: Reward) -> str:
 
 def load_runs(
     paths: Sequence[str],
-) -> tuple[dict[str, list[Scorer | PriorCostScorer]], str, SamplerConfig]:
-    """Return scorers by row (files of one loss and shape are its seeds).
+) -> tuple[dict[str, list[Scorer | PriorCostScorer]], RankingSetup]:
+    """Return scorers by row (files of one loss and shape are its seeds), and a setup.
 
     Where two of them have the same seed, each file is a row, as `row_names` has it.
 
@@ -248,4 +281,5 @@ def load_runs(
     runs: dict[str, list[Scorer | PriorCostScorer]] = {}
     for reward, (row, _) in zip(rewards, _rows(rewards), strict=True):
         runs.setdefault(row, []).append(scorer_of(reward))
-    return runs, preset, SamplerConfig(mode=mode)
+    sampler, own = SamplerConfig(mode=mode), own_cost_of(rewards)
+    return runs, RankingSetup(preset=preset, sampler=sampler, own=own)

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 
 from rcirl_jax.features import FeatureMap
+from rcirl_jax.planner.own_cost import OwnCost
 from rcirl_jax.planner.plan import Plan, PreviousPlan, committed, either, plan_of
 from rcirl_jax.planner.safety import SafetyConfig, check, choose
 from rcirl_jax.reward.familiarity import familiar_nowhere, familiarity
@@ -74,6 +75,8 @@ class RankConfig:
     safety: SafetyConfig = dataclasses.field(default_factory=SafetyConfig)
     # s for which a plan is kept, once chosen, as long as it is admissible
     commitment: float = 1.0
+    # the user's own cost, by which rows of its name drive
+    own: OwnCost | None = None
 
 
 def value_rows(
@@ -165,7 +168,7 @@ OWN_SCORES: dict[str, Score] = {
 class Ranking(flax.struct.PyTreeNode, kw_only=True):
     """The score of candidates, V_own + gain V_learned; `ranking` makes it."""
 
-    own: jax.Array  # [] place in OWN_SCORES
+    own: jax.Array  # [] place in OWN_SCORES; one beyond them: the user's own cost
     low: jax.Array  # [] gain where nothing is known
     high: jax.Array  # [] gain where all is
     reward: RewardParams  # effective
@@ -183,14 +186,14 @@ def ranking(
 
     Args:
       weights: effective parameters and normaliser of the learned reward.
-      own: what it is added to, of OWN_SCORES.
+      own: what it is added to: of OWN_SCORES, or the name of the user's own cost.
       gains: low and high; (0, 0) leaves the learned reward out.
       known: the familiarity, which matters where the gains differ.
     """
     params, normaliser = weights
     low, high = (jnp.asarray(gain, jnp.float32) for gain in gains)
     return Ranking(
-        own=jnp.asarray(list(OWN_SCORES).index(own)),
+        own=jnp.asarray([*OWN_SCORES, own].index(own)),
         low=low,
         high=high,
         reward=params,
@@ -200,11 +203,14 @@ def ranking(
 
 
 @functools.lru_cache(maxsize=16)
-def ranking_score(features: FeatureMap, activation: str) -> Score:
+def ranking_score(
+    features: FeatureMap, activation: str, user: OwnCost | None = None
+) -> Score:
     """Score of a `Ranking`, by the equation of the module.
 
     Of the own scores and the learned one, only what the ranking names is computed.
     """
+    owns = [*OWN_SCORES.values(), *([user.score] if user else [])]
 
     def learned(params: Ranking, scene: Scene, candidates: Candidates) -> jax.Array:
         rows = features.rows(scene, candidates)
@@ -216,7 +222,7 @@ def ranking_score(features: FeatureMap, activation: str) -> Score:
 
     def score(params: Ranking, scene: Scene, candidates: Candidates) -> jax.Array:
         seen = scene, candidates
-        own = jax.lax.switch(params.own, [*OWN_SCORES.values()], None, *seen)
+        own = jax.lax.switch(params.own, owns, None, *seen)
         uses = (params.low != 0.0) | (params.high != 0.0)
         nothing = lambda *_: jnp.zeros_like(own)  # noqa: E731
         return own + jax.lax.cond(uses, learned, nothing, params, *seen)
@@ -294,4 +300,5 @@ def rank_policy(score: Score, config: RankConfig) -> Policy:
 
 def ranking_policy(features: FeatureMap, activation: str, config: RankConfig) -> Policy:
     """The planner that drives by a `Ranking`."""
-    return rank_policy(ranking_score(features, activation), config)
+    score = ranking_score(features, activation, config.own)
+    return rank_policy(score, config)

@@ -18,7 +18,7 @@ from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.evaluation.attribution import attribute
 from rcirl_jax.evaluation.ranking.score import candidates_key
 from rcirl_jax.export.closed_loop import incumbent_score
-from rcirl_jax.export.loading import reward_params
+from rcirl_jax.export.loading import own_cost_of, reward_params
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.rank import Params, Score
@@ -132,7 +132,7 @@ def draw_frame(
     one = jax.tree.map(lambda x: jnp.asarray(x[0]), rows)
     prior, own = reward.prior_cost, (None, None)
     if prior is not None:
-        own = incumbent_score(prior.incumbent)
+        own = incumbent_score(prior.incumbent, own_cost_of([reward]))
     program = _sampled(reward.preset, sampler, own[0])
     made = program(candidates_key(jnp.asarray(row)), one, own[1])
     (candidates, human), (x, by_own) = made[:2], map(np.asarray, made[2:])

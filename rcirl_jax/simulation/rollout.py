@@ -143,6 +143,26 @@ def _seen(cases: Case, worlds: World, limits: jax.Array) -> Scene:
     return jax.vmap(observe)(cases, worlds, limits)
 
 
+def first_scenes(cases: Case) -> Scene:
+    """The first planning frame of each case [B]."""
+    cases = _completed(cases)
+    now, limits = _begin(cases)
+    return _seen(cases, now.worlds, limits)
+
+
+def _completed(cases: Case) -> Case:
+    """Cases [B] of one structure and type, whatever their source."""
+    count = cases.steps.shape[0]
+    nobody = jax.tree.map(
+        lambda x: np.broadcast_to(x, (count, *x.shape)), nobody_recorded()
+    )
+    cases = cases.replace(
+        replay=cases.replay or nobody,
+        ego_a=np.zeros(count, np.float32) if cases.ego_a is None else cases.ego_a,
+    )
+    return jax.tree.map(jnp.asarray, cases)
+
+
 @functools.lru_cache(maxsize=32)
 def _compiled(policy: Policy, plan_every: int, length: int, vehicle: Vehicle) -> Any:  # noqa: ANN401
     """The program of a span of `length` steps."""
@@ -207,15 +227,7 @@ def rollout(
       [span, B, L], which may end after the run, and the planning frames [B] that the
       configuration asks for.
     """
-    count, length = cases.steps.shape[0], config.span
-    filled = jax.tree.map(
-        lambda x: np.broadcast_to(x, (count, *x.shape)), nobody_recorded()
-    )
-    cases = cases.replace(
-        replay=cases.replay or filled,
-        ego_a=np.zeros(count, np.float32) if cases.ego_a is None else cases.ego_a,
-    )
-    cases = jax.tree.map(jnp.asarray, cases)
+    cases, length = _completed(cases), config.span
     programs = [
         (_compiled(policy, config.plan_every, length, config.vehicle), params)
         for policy, params in drivers

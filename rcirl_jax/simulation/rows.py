@@ -104,15 +104,16 @@ def baseline_row(
     """A baseline by its name in `BASELINES`.
 
     Args:
-      name: which one.
+      name: which one; or that of the user's own cost, `config.own`.
       preset: feature preset of the random weights.
       weights: of the learned reward, in whose program a baseline is ranked; random
         weights see its normalised inputs.
       config: of the ranking planner.
       activation: of the learned reward.
     """
-    if name not in BASELINES:
-        raise InputError(f"baselines: {name}: expected some of {', '.join(BASELINES)}")
+    known = [*BASELINES, *([config.own.name] if config.own else [])]
+    if name not in known:
+        raise InputError(f"baselines: {name}: expected some of {', '.join(known)}")
     if name in RULES:
         return rule_row(name, name)
     if name == "random weights":

@@ -28,8 +28,9 @@ from rcirl_jax.data.store.dataset import (
     open_dataset,
 )
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.export.closed_loop import checked_own_cost, table_rows
 from rcirl_jax.features import feature_map
+from rcirl_jax.planner.own_cost import is_place
 from rcirl_jax.planner.rank import Params, Policy, RankConfig
 from rcirl_jax.reward import effective_params, identity_normaliser, init_params
 from rcirl_jax.runtime.pipeline import digest, file_sha256
@@ -120,7 +121,7 @@ def _round(run: Run, number: int, learner: Path | None) -> Dataset:
     inputs = {
         "simulated_demonstrations": dataclasses.asdict(plan),
         "number": number,
-        "expert": run.incumbent_hash() if plan.expert == "incumbent" else "",
+        "expert": run.incumbent_hash() if plan.expert != "driver model" else "",
         "learner": file_sha256(learner) if learner else "",
     }
     key = digest({**inputs, **run.code()})[:8]
@@ -159,21 +160,27 @@ def expert_of(
 
     Args:
       plan: names the expert.
-      incumbent: weights file or "hand-set", of the expert "incumbent".
-      config: of the training: the hand-set cost drives in the program of its rewards.
+      incumbent: weights file, "hand-set" or the place of an own cost, which is the
+        expert "own cost" where it is given.
+      config: of the training: a cost drives in the program of its rewards.
 
     Raises:
       InputError: a file cannot be read.
     """
     if plan.expert == "driver model":
         return None
-    if plan.expert == "hand-set" or incumbent == "hand-set":
+    if plan.expert == "own cost" or incumbent == "hand-set" or is_place(incumbent):
+        own = checked_own_cost(incumbent) if is_place(incumbent) else None
         shape, features = config.reward, feature_map(config.features)
         count = features.num_features
         drawn = effective_params(init_params(jax.random.key(0), count, shape), shape)
         unused = drawn, identity_normaliser(count)
         row = baseline_row(
-            "hand-set", config.features, unused, RankConfig(), shape.activation
+            own.name if own else "hand-set",
+            config.features,
+            unused,
+            RankConfig(own=own),
+            shape.activation,
         )
     else:
         row = table_rows([incumbent], ())[0]

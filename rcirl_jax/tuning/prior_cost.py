@@ -22,11 +22,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from rcirl_jax.data.store.dataset import Dataset
+from rcirl_jax.data.store.dataset import Dataset, Demonstrations
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.ranking.score import candidates_key
 from rcirl_jax.export.reader import PriorCost
 from rcirl_jax.features import FeatureMap, feature_map
+from rcirl_jax.planner.own_cost import OwnCost
 from rcirl_jax.planner.prediction import with_predicted_futures
+from rcirl_jax.planner.rank import ONLINE, Params, Score, hand_score
 from rcirl_jax.reward.familiarity import (
     UNITS,
     Familiarity,
@@ -34,14 +37,15 @@ from rcirl_jax.reward.familiarity import (
     of_the_scene,
 )
 from rcirl_jax.runtime.atomic_files import read_json, write_json
-from rcirl_jax.sampling import trajectory_on_path
+from rcirl_jax.sampling import sample, trajectory_on_path
 from rcirl_jax.sampling.sampler import as_candidates
 from rcirl_jax.tuning.recipes import PriorCostConfig
 from rcirl_jax.tuning.run import Run
 from rcirl_jax.types import Scene
 from rcirl_jax.units import TIMES_S
 
-OWN_COST = "hand-set"  # what stands for the planner's own cost here
+OWN_COST = "hand-set"  # stands for the planner's own cost where none is given
+SPREAD_SCENES = 512  # training scenes in which costs are compared
 STEPS = 1500
 STEP_SIZE = 1e-2
 DECAY = 1e-3
@@ -57,8 +61,15 @@ def fitted_prior_cost(
     shares: Sequence[float],
     elsewhere: Sequence[Dataset],
     features: FeatureMap,
+    own: OwnCost | None = None,
 ) -> PriorCost:
     """The prior cost of a weights file, from the training splits.
+
+    Gains of a recipe are in units of the hand-set cost. Those of another own cost are
+
+        gain = gain of the recipe * spread(own cost) / spread(hand-set cost)
+
+    so that an own cost times 7, or plus 3, drives the same.
 
     Args:
       config: gains.
@@ -66,6 +77,7 @@ def fitted_prior_cost(
       shares: > 0, how much each of them counts.
       elsewhere: simulated demonstrations.
       features: of the reward.
+      own: the user's own cost; None: the hand-set one.
     """
     mine = [_training_scenes(one, features) for one in recorded]
     pairs = zip(mine, shares, strict=True)
@@ -79,7 +91,40 @@ def fitted_prior_cost(
     )
     arrays = {name: np.asarray(getattr(made, name)) for name in ARRAYS}
     arrays["offset"] = arrays["offset"].reshape(1)
-    return PriorCost(incumbent=OWN_COST, low=config.low, high=config.high, **arrays)
+    name, unit = OWN_COST, 1.0
+    if own is not None:
+        scenes, rows = spread_scenes(recorded)
+        each = spread(scenes, rows, own.score), spread(scenes, rows, hand_score)
+        name, unit = own.name, float(each[0] / each[1])
+    low, high = config.low * unit, config.high * unit
+    return PriorCost(incumbent=name, low=low, high=high, **arrays)
+
+
+def spread_scenes(sources: Sequence[Demonstrations]) -> tuple[Scene, np.ndarray]:
+    """Training scenes, as many of every source, and their rows; numpy leaves."""
+    each = [one.indices("train") for one in sources]
+    count = min(SPREAD_SCENES // len(each), *(index.size for index in each))
+    rows = [index[np.linspace(0, index.size - 1, count).astype(int)] for index in each]
+    parts = [one.read(some).scene for one, some in zip(sources, rows, strict=True)]
+    scenes = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    return scenes, np.concatenate(rows)
+
+
+@functools.partial(jax.jit, static_argnames="score")
+def spread(
+    scenes: Scene, rows: jax.Array, score: Score, params: Params = None
+) -> jax.Array:
+    """Mean [] over scenes [S] of the deviation of a score over feasible candidates."""
+
+    def one(item: tuple[Scene, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        scene = with_predicted_futures(item[0])
+        scene = scene.replace(time_valid=jnp.ones_like(scene.time_valid))
+        candidates = sample(candidates_key(item[1]), scene, ONLINE)
+        values = score(params, scene, candidates)
+        return jnp.std(values, where=candidates.feasible), jnp.any(candidates.feasible)
+
+    found, counts = jax.lax.map(one, (scenes, rows))
+    return jnp.mean(found, where=counts)
 
 
 def write_prior_cost(path: Path, prior_cost: PriorCost) -> None:
@@ -218,11 +263,14 @@ def fit_prior_cost(
         "shares": list(shares),
         "drives": [one.hash for one in drives],
         "features": config.train.features,
+        "own_cost": run.own_cost.sha256 if run.own_cost else OWN_COST,
     }
 
     def work() -> None:
         features = feature_map(config.train.features)
-        made = fitted_prior_cost(config.prior_cost, sources, shares, drives, features)
+        made = fitted_prior_cost(
+            config.prior_cost, sources, shares, drives, features, run.own_cost
+        )
         write_prior_cost(path, made)
 
     run.stage(f"prior cost {len(drives)}", inputs, [path], work)

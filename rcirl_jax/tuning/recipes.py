@@ -33,7 +33,8 @@ TABLES = ("about", "train", "collect", SIMULATED, "prior_cost", "autotune")
 # of a run, not of a recipe
 NOT_OF_A_RECIPE = ("seed", "reward", "sampler")
 PRESETS_OWN = ("scene_gating", "signs")  # of a reward, what its feature preset says
-EXPERTS = ("none", "driver model", "hand-set", "incumbent")
+# own cost: the incumbent where it is one, else the hand-set cost
+EXPERTS = ("none", "driver model", "own cost", "incumbent")
 SUITE_SEED = 0  # of the catalogue that rewards are judged on
 
 

@@ -28,9 +28,11 @@ from typing import Any
 from rcirl_jax.data.store.dataset import EQUAL, Dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.gate.types import GateConfig
+from rcirl_jax.export.closed_loop import checked_own_cost
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.sweep import read_sweep
+from rcirl_jax.planner.own_cost import OwnCost, is_place
 from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.runtime.pipeline import Stages, code_sha256, file_sha256
 from rcirl_jax.simulation.rows import BASELINES
@@ -58,7 +60,8 @@ class TuneConfig:
 
     train: TrainConfig
     gate: GateConfig
-    incumbent: str = "hand-set"  # weights file or baseline
+    # weights file, baseline, or place of an own cost
+    incumbent: str = "hand-set"
     simulated: SimulatedDemonstrations = dataclasses.field(
         default_factory=SimulatedDemonstrations
     )
@@ -177,11 +180,19 @@ class Run:
         return {**self.facts, "weights_sha256": {r.file: r.sha256 for r in rewards}}
 
     def incumbent_reward(self) -> Reward | None:
-        """The incumbent's reward; None: a baseline."""
+        """The incumbent's reward; None: a baseline or an own cost."""
         name = self.config.incumbent
-        return None if name in BASELINES else open_reward(name)
+        return None if name in BASELINES or is_place(name) else open_reward(name)
+
+    @property
+    def own_cost(self) -> OwnCost | None:
+        """The user's own cost, where it is the incumbent."""
+        name = self.config.incumbent
+        return checked_own_cost(name) if is_place(name) else None
 
     def incumbent_hash(self) -> str:
         """The sha256 of the incumbent's file, or the baseline's name."""
         name = self.config.incumbent
+        if self.own_cost:
+            return self.own_cost.sha256
         return name if name in BASELINES else file_sha256(Path(name))

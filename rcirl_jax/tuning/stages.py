@@ -107,7 +107,7 @@ def train_one(
         train(dataset, workdir, config, running=run.running, provenance=facts)
         file.parent.mkdir(parents=True, exist_ok=True)
         known = read_prior_cost(prior) if prior else None
-        export_run(workdir, dataset, file, prior_cost=known)
+        export_run(workdir, dataset, file, prior_cost=known, own=run.own_cost)
 
     run.stage(stage, inputs, [file], work)
 
@@ -174,8 +174,10 @@ def _rank(run: Run, dataset: Demonstrations, futures: str) -> None:
             horizon_s=config.horizon_s,
             futures=futures,
             tuned={TUNED_IDM_ROW: [tuned]},
+            own=run.own_cost,
         )
-        own = [INCUMBENT] if known else []
+        own = [run.own_cost.name] if run.own_cost else []
+        own += [INCUMBENT] if known else []
         references = [*own, "hand-set", TUNED_IDM_ROW, "random"]
         report = evaluate_ranking(dataset, learned, setup, run.executor, references)
         write_whole(text, format_table(report, 118) + "\n")
@@ -214,7 +216,7 @@ def simulate(run: Run, sources: Sequence[Dataset]) -> None:
 
     The held-out drives, of all sources, measure every row's distance to the human.
     """
-    job, _ = suite_job(run)
+    job, incumbent = suite_job(run)
     decides = {
         **dataclasses.asdict(job),
         "refs": digest([ref.id for ref in job.refs]),
@@ -236,7 +238,7 @@ def simulate(run: Run, sources: Sequence[Dataset]) -> None:
 
     def compare() -> None:
         drives = held_out(sources, run.config.drives)
-        found = held_out_likeness(drives, job.rows(), job.plan_every)
+        found = held_out_likeness(drives, job.rows(), job.plan_every, incumbent)
         write_arrays(arrays, found.likeness)
         write_json(body, {**found.facts, "made_by": run.provenance()})
         write_whole(text, found.text())

@@ -20,7 +20,7 @@ epochs = 1
 loss = "listwise"
 positive = "nearest"
 [simulated_demonstrations]
-expert = "hand-set"
+expert = "own cost"
 cases = 1
 takeover_cases = 1
 rounds = 1

@@ -125,8 +125,8 @@ def test_export_and_rank(dataset, run, tmp_path):
     assert reward.provenance["config"] == config
     assert reward.provenance["dataset_sha256"] == dataset.hash
     assert reward.provenance["steps"] == int(run[1].state.step)
-    learned, preset, _ = load_runs([reward.file])
-    setup = RankingSetup(preset=preset, sampler=SMALL)
+    learned, setup = load_runs([reward.file])
+    setup = dataclasses.replace(setup, sampler=SMALL)
     report = evaluate_ranking(dataset, learned, setup)
     baselines = ("constant speed", "IDM", "hand-set", "hand-set DP")
     assert set(report.rows) == {"RC-IRL 21-15-1", "random", *baselines, "oracle"}

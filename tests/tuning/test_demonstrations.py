@@ -13,7 +13,7 @@ from tests.helpers.weights_files import random_weights
     [(1.2, 2, (1.2, 0.8, 0.8)), (0.0, 1, (0.0, 0.0)), (1.0, 0, (1.0,))],
 )
 def test_what_is_not_learned_from_has_no_weight_in_any_round(weight, rounds, weights):
-    plan = SimulatedDemonstrations(expert="hand-set", weight=weight, rounds=rounds)
+    plan = SimulatedDemonstrations(expert="own cost", weight=weight, rounds=rounds)
     assert plan.weights == weights
     assert SimulatedDemonstrations(expert="none", rounds=rounds).weights == ()
 
@@ -29,7 +29,7 @@ def test_a_learner_that_only_shows_where_it_gets_to_drives_alone(
 
     monkeypatch.setattr(demonstrations, "drive_catalogue", drive)
     monkeypatch.setattr(demonstrations, "open_dataset", lambda output: output)
-    plan = SimulatedDemonstrations(expert="hand-set", weight=weight, catalogue_seed=70)
+    plan = SimulatedDemonstrations(expert="own cost", weight=weight, catalogue_seed=70)
     demonstrations.drive_round(
         1,
         plan,

@@ -28,7 +28,7 @@ class Time:
 
 def a_run(*finished):
     """What the clock reads of a run of which an earlier process has finished stages."""
-    simulated = SimulatedDemonstrations(expert="hand-set", rounds=1)
+    simulated = SimulatedDemonstrations(expert="own cost", rounds=1)
     return types.SimpleNamespace(
         said=[], done=[], config=types.SimpleNamespace(simulated=simulated),
         stages=types.SimpleNamespace(read=lambda: dict.fromkeys(finished)),

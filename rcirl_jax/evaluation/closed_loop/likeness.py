@@ -77,6 +77,7 @@ class LikenessReport:
     ids: tuple[str, ...]
     clusters: np.ndarray  # [D] int, the ego's vehicle
     recordings: int
+    references: tuple[str, ...] = REFERENCES  # rows that the others are compared with
 
     @property
     def distance(self) -> dict[str, np.ndarray]:
@@ -93,7 +94,7 @@ class LikenessReport:
     def facts(self) -> dict:
         """All numbers, for a JSON file.
 
-        A row's `minus` are its differences to `REFERENCES`, clustered by vehicle;
+        A row's `minus` are its differences to the references, clustered by vehicle;
         below 0 is nearer. `unlikeness` is the Jensen-Shannon distance to the human's
         distributions of `HISTOGRAMS`.
         """
@@ -101,7 +102,7 @@ class LikenessReport:
         human, body = self.rows[RECORDED_HUMAN], {}
         for name, row in self.rows.items():
             mean = combine_seeds(row.distance[None], bootstrap)
-            others = [n for n in REFERENCES if n in found and n != name]
+            others = [n for n in self.references if n in found and n != name]
             body[name] = {
                 "distance_m": {"mean": mean.value, "low": mean.low, "high": mean.high},
                 "at_m": {
@@ -135,7 +136,7 @@ class LikenessReport:
     def text(self) -> str:
         """Formats the table, nearest row first, and the differences."""
         facts, times = self.facts, [f"{t:g}" for t in TIMES_SHOWN_S]
-        known = [name for name in REFERENCES if name in self.rows]
+        known = [name for name in self.references if name in self.rows]
         cell = "{mean:.2f} [{low:.2f}, {high:.2f}]".format_map
         apart = "{mean:+.2f} [{low:+.2f}, {high:+.2f}]".format_map
         rows = [
@@ -223,7 +224,10 @@ def jensen_shannon(a: np.ndarray, b: np.ndarray, name: str) -> float:
 
 
 def held_out_likeness(
-    drives: HeldOut, rows: Sequence[Row], plan_every: int = 1
+    drives: HeldOut,
+    rows: Sequence[Row],
+    plan_every: int = 1,
+    incumbent: str = REFERENCES[0],
 ) -> LikenessReport:
     """Drives every row, and the recorded human, over the held-out drives.
 
@@ -231,6 +235,7 @@ def held_out_likeness(
       drives: of `simulation.recorded.held_out`.
       rows: learned rows, baselines; names are distinct.
       plan_every: steps of 0.1 s between two plans, of rows that need no other.
+      incumbent: a row that the others are compared with, besides `REFERENCES`.
 
     Raises:
       InputError: a name twice, drives of one vehicle, or a drive with no number.
@@ -256,6 +261,7 @@ def held_out_likeness(
         ids=drives.ids,
         clusters=np.unique(drives.vehicle, return_inverse=True)[1],
         recordings=int(np.unique(drives.recording).size),
+        references=tuple(dict.fromkeys((incumbent, *REFERENCES))),
     )
 
 

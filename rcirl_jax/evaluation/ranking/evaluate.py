@@ -17,7 +17,6 @@ from rcirl_jax.evaluation.ranking.metrics import (
 )
 from rcirl_jax.evaluation.ranking.report import Ranked, RankingReport, build_report
 from rcirl_jax.evaluation.ranking.score import (
-    BASELINES,
     PriorCostScorer,
     RankingSetup,
     Scorer,
@@ -107,7 +106,7 @@ def rank_scenes(
     table = {
         **runs(learned),
         "random": random,
-        **{name: [of(name)] for name in BASELINES},
+        **{name: [of(name)] for name in setup.baselines},
         **runs(setup.tuned),
         "oracle": [metrics("oracle", *best)],
     }

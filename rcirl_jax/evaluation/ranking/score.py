@@ -25,6 +25,7 @@ from rcirl_jax.planner.baselines import (
     constant_speed_trajectory,
     idm_trajectory,
 )
+from rcirl_jax.planner.own_cost import OwnCost
 from rcirl_jax.planner.prediction import select_future, with_predicted_futures
 from rcirl_jax.reward import (
     SPEED_DP_ROW,
@@ -36,6 +37,7 @@ from rcirl_jax.reward import (
 from rcirl_jax.runtime.compiling import CompilesFirst
 from rcirl_jax.runtime.executors import Executor, Serial
 from rcirl_jax.sampling import SamplerConfig, sample
+from rcirl_jax.sampling.sampler import as_candidates
 from rcirl_jax.train.featurise import human_of
 from rcirl_jax.types import Candidates, Demonstration, Scene, Trajectory
 from rcirl_jax.units import DT_S, NUM_TIMES, TIMES_S
@@ -62,7 +64,7 @@ Scorer = Callable[[np.ndarray, np.ndarray], np.ndarray]
 class PriorCostScorer:
     """A reward on top of a baseline's values."""
 
-    incumbent: str  # of BASELINES
+    incumbent: str  # of `RankingSetup.baselines`
     # (features [..., T, F], the incumbent's values [...], time_valid [..., T]) -> [...]
     total: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
@@ -90,6 +92,13 @@ class RankingSetup:
     drop_collisions: bool = False
     # further hand-set costs and drivers that are ranked: row -> runs
     tuned: Mapping[str, Sequence[Baseline]] = dataclasses.field(default_factory=dict)
+    # the user's own cost, a further baseline
+    own: OwnCost | None = None
+
+    @property
+    def baselines(self) -> tuple[str, ...]:
+        """Names of the baselines without parameters."""
+        return (*BASELINES, *([self.own.name] if self.own else []))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -235,6 +244,7 @@ def score_scenes(
         setup.sampler,
         float(setup.horizon_s),
         tuple((name, type(baseline)) for name, baseline in tuned.items()),
+        setup.own,
     )
     given = (
         {name: baseline.fields() for name, baseline in tuned.items()},
@@ -264,6 +274,7 @@ def _score_batch(
     sampler: SamplerConfig,
     horizon_s: float,
     kinds: tuple[tuple[str, type[Baseline]], ...],
+    own: OwnCost | None,
 ) -> Callable:
     """Compiles what makes the arrays of a chunk.
 
@@ -287,11 +298,12 @@ def _score_batch(
         candidates, fde, ade = measured(index, demonstration, scene, sampler, horizon_s)
 
         # the human's stands behind the candidates: one pass for all
-        ways = jax.tree.map(
-            lambda many, one: jnp.concatenate([many, one[None]]),
-            candidates.trajectory,
-            human,
+        both = jax.tree.map(
+            lambda many, one: jnp.concatenate([many, one]),
+            candidates,
+            as_candidates(human),
         )
+        ways = both.trajectory
 
         def near_to(way: Trajectory) -> jax.Array:
             return jax.vmap(lambda x: closeness(x, way, mask))(ways)
@@ -307,9 +319,11 @@ def _score_batch(
             "constant speed": near_to(constant_speed_trajectory(scene, on_path)),
             **{name: valued(x) for name, x in {**usual, **tuned}.items()},
         }
+        if own is not None:
+            values[own.name] = own.score(None, cut, both)
         hit = COLUMNS["collision"](candidate_frames(recorded, ways))  # [T, K + 1]
         crash = jnp.any((hit > 0.0) & mask[:, None], axis=0)
-        made = features.of_candidates(scene, candidates.replace(trajectory=ways))
+        made = features.of_candidates(scene, both)
         return {
             "features_human": made[-1],
             "features": made[:-1],

@@ -1,0 +1,162 @@
+"""The process in which an own cost of numpy or C is computed; see `own_cost`.
+
+    python -m rcirl_jax.planner.own_cost_process costs.py:my_cost
+
+Reads pickled batches from standard input, each after its length, and writes
+("costs", [n, K]) or ("wrong", a line) likewise. Knows nothing of JAX, so that it starts
+at once. What the cost prints goes to standard error.
+"""
+
+import ctypes
+import importlib.util
+import os
+import pickle
+import struct
+import sys
+import types
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+ABI = 1  # RCIRL_COST_ABI
+TIMES_S = np.linspace(0.0, 8.0, 18, dtype=np.float32)
+STATION_STEP_M = 2.0
+_FLOATS, _INTS = ctypes.POINTER(ctypes.c_float), ctypes.POINTER(ctypes.c_int32)
+_BYTES = ctypes.POINTER(ctypes.c_uint8)
+EGO = ("s", "l", "dl", "ddl", "v", "a", "length", "width")
+PATH = (
+    *("kappa", "l", "speed_limit", "lane_left", "lane_right"),
+    *("road_left", "road_right"),
+)
+BOXES = ("s_lower", "s_upper", "l_lower", "l_upper", "speed")
+MOTION = ("s", "v", "a", "j", "l", "dl", "ddl")
+
+
+class CScene(ctypes.Structure):
+    """`rcirl_scene` of cost_abi.h."""
+
+    _fields_ = [
+        *((f"ego_{name}", ctypes.c_float) for name in EGO),
+        ("num_stations", ctypes.c_int32),
+        ("station_step", ctypes.c_float),
+        *((f"path_{name}", _FLOATS) for name in PATH),
+        ("num_times", ctypes.c_int32),
+        ("times", _FLOATS),
+        ("time_valid", _BYTES),
+        ("num_obstacles", ctypes.c_int32),
+        ("kind", _INTS),
+        ("obstacle_a", _FLOATS),
+        ("obstacle_l_dot", _FLOATS),
+        *((name, _FLOATS) for name in BOXES),
+        ("valid", _BYTES),
+    ]
+
+
+class CCandidates(ctypes.Structure):
+    """`rcirl_candidates` of cost_abi.h."""
+
+    _fields_ = [
+        ("count", ctypes.c_int32),
+        ("num_times", ctypes.c_int32),
+        *((name, _FLOATS) for name in MOTION),
+        ("feasible", _BYTES),
+    ]
+
+
+def library_cost(path: str) -> Callable[[Any, Any], np.ndarray]:
+    """Makes the cost of a C library."""
+    library = ctypes.CDLL(os.path.abspath(path))
+    for name in ("rcirl_cost_abi", "rcirl_cost"):
+        if not hasattr(library, name):
+            raise ValueError(f"{name}: missing: expected the functions of cost_abi.h")
+    if (found := library.rcirl_cost_abi()) != ABI:
+        raise ValueError(f"rcirl_cost_abi: {found}: expected {ABI}")
+
+    def cost(scene: Any, candidates: Any) -> np.ndarray:  # noqa: ANN401
+        kept = []  # arrays that pointers point into
+
+        def pointer(values: Any, kind: type, to: Any) -> Any:  # noqa: ANN401
+            array = np.ascontiguousarray(values, kind)
+            kept.append(array)
+            return array.ctypes.data_as(to)
+
+        floats = lambda values: pointer(values, np.float32, _FLOATS)  # noqa: E731
+        flags = lambda values: pointer(values, np.uint8, _BYTES)  # noqa: E731
+        ego, path, others = scene.ego, scene.path, scene.obstacles
+        given = CScene(
+            **{f"ego_{name}": float(getattr(ego, name)) for name in EGO},
+            num_stations=len(path.kappa),
+            station_step=STATION_STEP_M,
+            **{f"path_{name}": floats(getattr(path, name)) for name in PATH},
+            num_times=len(TIMES_S),
+            times=floats(TIMES_S),
+            time_valid=flags(scene.time_valid),
+            num_obstacles=len(others.kind),
+            kind=pointer(others.kind, np.int32, _INTS),
+            obstacle_a=floats(others.a),
+            obstacle_l_dot=floats(others.l_dot),
+            **{name: floats(getattr(others, name)) for name in BOXES},
+            valid=flags(others.valid),
+        )
+        motion = candidates.trajectory
+        count = len(candidates.feasible)
+        chosen = CCandidates(
+            count=count,
+            num_times=len(TIMES_S),
+            **{name: floats(getattr(motion, name)) for name in MOTION},
+            feasible=flags(candidates.feasible),
+        )
+        costs = (ctypes.c_double * count)(*[float("nan")] * count)
+        status = library.rcirl_cost(ctypes.byref(given), ctypes.byref(chosen), costs)
+        if status:
+            raise ValueError(f"rcirl_cost: status {status}: expected 0")
+        return np.array(costs)
+
+    return cost
+
+
+def python_cost(place: str) -> Callable[[Any, Any], np.ndarray]:
+    """Makes the cost of a function in a Python file."""
+    stem, _, name = place.partition(".py:")
+    spec = importlib.util.spec_from_file_location("own_cost", stem + ".py")
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{stem}.py: expected a Python file")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return getattr(module, name)
+
+
+def _node(tree: Any, number: int) -> Any:  # noqa: ANN401
+    """One of a batch, with attributes instead of keys."""
+    if isinstance(tree, dict):
+        return types.SimpleNamespace(**{k: _node(x, number) for k, x in tree.items()})
+    return tree[number]
+
+
+def main() -> None:
+    """Answers until standard input ends."""
+    place, answers = sys.argv[1], os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    cost: Callable[[Any, Any], np.ndarray] | None = None
+    while head := sys.stdin.buffer.read(8):
+        given = pickle.loads(sys.stdin.buffer.read(*struct.unpack("<Q", head)))
+        try:
+            if cost is None:
+                is_library = place.endswith(".so")
+                cost = library_cost(place) if is_library else python_cost(place)
+            made: tuple = ("costs", None)
+            if given is not None:
+                scene, candidates = given["scene"], given["candidates"]
+                count = len(candidates["feasible"])
+                pairs = [(_node(scene, i), _node(candidates, i)) for i in range(count)]
+                made = "costs", np.stack([np.asarray(cost(*x), float) for x in pairs])
+        except Exception as error:
+            made = "wrong", f"{type(error).__name__}: {error}"
+        text = pickle.dumps(made, protocol=5)
+        answers.write(struct.pack("<Q", len(text)) + text)
+        answers.flush()
+
+
+if __name__ == "__main__":
+    main()

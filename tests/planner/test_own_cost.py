@@ -1,0 +1,139 @@
+"""A planner's own cost: of JAX, numpy and C the same; what is none is one line."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks.common import untrained
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.closed_loop import checked_own_cost
+from rcirl_jax.planner import own_cost as module
+from rcirl_jax.planner.own_cost import OwnCost, check_own_cost, own_cost
+from rcirl_jax.planner.rank import ONLINE, RankConfig
+from rcirl_jax.sampling import sample
+from rcirl_jax.simulation.rollout import first_scenes
+from rcirl_jax.simulation.rows import baseline_row
+from rcirl_jax.simulation.suite import (
+    build,
+    drive_row,
+    rollout_config,
+    suite_refs,
+)
+
+COSTS = Path(__file__).parent / "costs"
+INCLUDE = Path(__file__).parents[2] / "onboard" / "include"
+
+
+def place(name):
+    return f"{COSTS / 'costs.py'}:{name}"
+
+
+@pytest.fixture(scope="module")
+def some():
+    """Scenes and candidates of 60 cases."""
+    scenes = first_scenes(build(suite_refs("full", 3, seed=2)[:60], 1.0))
+    keys = jax.random.split(jax.random.key(1), 60)
+    draw = jax.jit(jax.vmap(lambda key, scene: sample(key, scene, ONLINE)))
+    return scenes, draw(keys, scenes)
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    compiler = shutil.which("c++")
+    if compiler is None:
+        pytest.skip("no C++ compiler")
+    file = tmp_path_factory.mktemp("cost") / "libheadway.so"
+    build_it = [compiler, "-std=c++17", "-O2", "-shared", "-fPIC", "-Wall", "-Wextra"]
+    command = [*build_it, f"-I{INCLUDE}", "-o", str(file), str(COSTS / "cost.cpp")]
+    subprocess.run(command, check=True)
+    return str(file)
+
+
+def costs_of(cost, some):
+    return -np.asarray(jax.jit(jax.vmap(lambda *x: cost.score(None, *x)))(*some))
+
+
+def test_jax_numpy_and_c_say_the_same(some, library):
+    by_jax = own_cost(place("headway_cost"))
+    expected = costs_of(by_jax, some)
+    assert by_jax.form == "JAX"
+    assert np.ptp(expected, axis=1).min() > 0.01
+    for other in (own_cost(place("numpy_cost")), own_cost(library)):
+        found = costs_of(other, some)
+        np.testing.assert_allclose(found, expected, rtol=2e-5, atol=1e-4)
+        assert other.form != "JAX"
+    assert own_cost(library).name == "headway"
+
+
+def driven(place_of):
+    """Metrics of ten short cases with a cost alone."""
+    own = own_cost(place_of) if place_of else None
+    name = own.name if own else "hand-set"
+    row = baseline_row(name, "paper21", untrained(), RankConfig(own=own))
+    refs = suite_refs("cut_in,traffic", 5)
+    cases = lambda a, b: build(refs[a:b], 6.0)  # noqa: E731
+    return drive_row(row, cases, len(refs), rollout_config(row, 6.0, 1), chunk=30)
+
+
+def test_a_copy_of_the_hand_set_cost_drives_as_it_does():
+    ours, theirs = driven(place("copied")), driven("")
+    assert all(jax.tree.leaves(jax.tree.map(np.array_equal, ours, theirs)))
+
+
+def test_what_is_called_back_drives_as_what_is_traced(library):
+    by_jax, by_c = driven(place("headway_cost")), driven(library)
+    np.testing.assert_allclose(by_c.progress, by_jax.progress, rtol=1e-3)
+    assert np.ptp(by_jax.progress) > 5.0
+    times_seven = driven(place("seven_and_three"))
+    np.testing.assert_allclose(times_seven.progress, by_jax.progress, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [
+        ("constant", r"constant: in 100% of 60 scenes all candidates cost the same"),
+        ("nan", r"nan: scene 0, candidate 0: nan: expected a finite cost"),
+        ("one_too_few", r"one_too_few: shape \(\d+,\) for \d+ candidates: expected"),
+        ("random", r"random: scene 0, candidate 0: .*, then .*: expected the same"),
+        ("dies", r"dies: its process ended with status 9: expected costs"),
+        ("endless", r"endless: no answer in 1 s: expected costs"),
+    ],
+)
+def test_what_is_no_cost_is_one_line(name, line, some, monkeypatch):
+    monkeypatch.setattr(module, "CALL_S", 1.0)
+    with pytest.raises(InputError, match=line):
+        check_own_cost(own_cost(place(name)), *some)
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        ("nowhere.py:f", r"nowhere.py:f: No such file"),
+        (place("headway_cots"), r"headway_cots: expected a function .* headway_cost"),
+    ],
+)
+def test_what_is_not_there_is_one_line(given, line):
+    with pytest.raises(InputError, match=line):
+        own_cost(given)
+
+
+def test_a_library_that_is_none(tmp_path, some):
+    file = tmp_path / "libnone.so"
+    file.write_bytes(b"no library")
+    with pytest.raises(InputError, match=r"libnone.so: OSError: .*expected costs"):
+        check_own_cost(own_cost(str(file)), *some)
+
+
+def test_a_name_that_a_row_has(some):
+    cost = own_cost(place("headway_cost"))
+    with pytest.raises(InputError, match="another name than the rows'"):
+        check_own_cost(cost, *some, names=["headway_cost", "IDM"])
+
+
+def test_a_good_one_passes_over_the_catalogue():
+    cost = checked_own_cost(place("headway_cost"))
+    assert cost == OwnCost(place=cost.place, sha256=cost.sha256)
