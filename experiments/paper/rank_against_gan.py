@@ -27,10 +27,12 @@ and 276 cases of 120 s: half an hour of two cores, with the recipe `paper` a qua
 
 import dataclasses
 import datetime
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from absl import flags
@@ -68,7 +70,7 @@ from rcirl_jax.evaluation.ranking.learners import (
     fitting_rows,
     train_learner,
 )
-from rcirl_jax.evaluation.ranking.score import RankingSetup
+from rcirl_jax.evaluation.ranking.score import RankingSetup, candidates_key
 from rcirl_jax.evaluation.statistics import (
     Difference,
     combine_seeds,
@@ -80,22 +82,19 @@ from rcirl_jax.export.from_run import verification_samples, write_weights
 from rcirl_jax.export.loading import open_reward, scorer_of
 from rcirl_jax.export.reader import PriorCost
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.rank import hand_score
+from rcirl_jax.planner.prediction import with_predicted_futures
+from rcirl_jax.planner.rank import ONLINE, Params, Score, hand_score
 from rcirl_jax.report.charts import Interval, interval_chart
 from rcirl_jax.reward import LOSSES, seen_range
+from rcirl_jax.sampling import sample
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
 from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.tuning.demonstrations import drive_round
-from rcirl_jax.tuning.prior_cost import (
-    OWN_COST,
-    PriorCostConfig,
-    fitted_prior_cost,
-    spread,
-    spread_scenes,
-)
+from rcirl_jax.tuning.prior_cost import OWN_COST, PriorCostConfig, fitted_prior_cost
 from rcirl_jax.tuning.recipes import DEFAULT, load_recipe
+from rcirl_jax.types import Scene
 
 _LOSSES = flags.DEFINE_list(
     "losses", None, "default: rank, gan, and listwise unless the recipe's own is rank"
@@ -110,6 +109,7 @@ fixed(horizon=5.0)  # of the ranking; learners compare as far as the recipe says
 FORMS = ("alone", "anchored")
 BASELINES = (OWN_COST, "IDM", *TRIVIAL_BASELINES)
 RANKED_BASELINES = (OWN_COST, "IDM")
+SPREAD_SCENES = 256  # of each source
 QUICK_DRIVE_S = 12.0  # s of a drive; its scenes need 8 s of future
 
 
@@ -181,6 +181,30 @@ def fitted(shares: PriorCostConfig, sources: Sequence[Demonstrations]) -> PriorC
     return fitted_prior_cost(shares, recorded, [1.0] * len(sources), [drives], features)
 
 
+def some_scenes(sources: Sequence[Demonstrations]) -> tuple[Scene, np.ndarray]:
+    """Training scenes, as many of every source, and their rows; numpy leaves."""
+    each = [one.indices("train") for one in sources]
+    rows = [x[np.linspace(0, x.size - 1, SPREAD_SCENES).astype(int)] for x in each]
+    scenes = [one.read(row).scene for one, row in zip(sources, rows, strict=True)]
+    return jax.tree.map(lambda *x: np.concatenate(x), *scenes), np.concatenate(rows)
+
+
+@functools.partial(jax.jit, static_argnames="score")
+def spread(scenes: Scene, rows: jax.Array, score: Score, params: Params) -> jax.Array:
+    """Mean [] over scenes [S] of the deviation over their feasible candidates."""
+
+    def one(item: tuple[Scene, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        scene = with_predicted_futures(item[0])
+        scene = scene.replace(time_valid=jnp.ones_like(scene.time_valid))
+        candidates = sample(candidates_key(item[1]), scene, ONLINE)
+        counts = candidates.feasible
+        values = score(params, scene, candidates)
+        return jnp.std(values, where=counts), jnp.any(counts)
+
+    found, counts = jax.lax.map(one, (scenes, rows))
+    return jnp.mean(found, where=counts)
+
+
 def written(
     learned: Sequence[Learned],
     prior_cost: PriorCost,
@@ -189,11 +213,11 @@ def written(
     seen: np.ndarray,
 ) -> tuple[dict[str, str], dict[str, float]]:
     """Weights files by run, "LOSS FORM SEED", and the spread of every V."""
-    scenes, rows = spread_scenes(sources)
+    scenes, rows = some_scenes(sources)
     samples = verification_samples(data, learned[0].config)
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     made_by = {**provenance(), "dataset_sha256": data.hash, "created": now}
-    spreads = {OWN_COST: float(spread(scenes, rows, hand_score))}
+    spreads = {OWN_COST: float(spread(scenes, rows, hand_score, None))}
     files: dict[str, dict[str, str]] = {form: {} for form in FORMS}
 
     def save(form: str, one: Learned, on: PriorCost | None) -> str:

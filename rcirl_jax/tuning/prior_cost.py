@@ -29,7 +29,7 @@ from rcirl_jax.export.reader import PriorCost
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.planner.own_cost import OwnCost
 from rcirl_jax.planner.prediction import with_predicted_futures
-from rcirl_jax.planner.rank import ONLINE, Params, Score, hand_score
+from rcirl_jax.planner.rank import ONLINE, Score, hand_score
 from rcirl_jax.reward.familiarity import (
     UNITS,
     Familiarity,
@@ -45,7 +45,7 @@ from rcirl_jax.types import Scene
 from rcirl_jax.units import TIMES_S
 
 OWN_COST = "hand-set"  # stands for the planner's own cost where none is given
-SPREAD_SCENES = 512  # training scenes in which costs are compared
+COMPARED_SCENES = 256  # training scenes of each source in which costs are compared
 STEPS = 1500
 STEP_SIZE = 1e-2
 DECAY = 1e-3
@@ -67,9 +67,11 @@ def fitted_prior_cost(
 
     Gains of a recipe are in units of the hand-set cost. Those of another own cost are
 
-        gain = gain of the recipe * spread(own cost) / spread(hand-set cost)
+        gain = gain of the recipe * unit(own cost) / unit(hand-set cost)
+        unit(c) = median over scenes of (lower quartile of c - min of c)
 
-    so that an own cost times 7, or plus 3, drives the same.
+    over the feasible candidates: what a cost sets between candidates that it would
+    hardly choose says nothing. An own cost times 7, or plus 3, drives the same.
 
     Args:
       config: gains.
@@ -93,17 +95,17 @@ def fitted_prior_cost(
     arrays["offset"] = arrays["offset"].reshape(1)
     name, unit = OWN_COST, 1.0
     if own is not None:
-        scenes, rows = spread_scenes(recorded)
-        each = spread(scenes, rows, own.score), spread(scenes, rows, hand_score)
+        scenes, rows = some_scenes(recorded)
+        each = unit_of(scenes, rows, own.score), unit_of(scenes, rows, hand_score)
         name, unit = own.name, float(each[0] / each[1])
     low, high = config.low * unit, config.high * unit
     return PriorCost(incumbent=name, low=low, high=high, **arrays)
 
 
-def spread_scenes(sources: Sequence[Demonstrations]) -> tuple[Scene, np.ndarray]:
+def some_scenes(sources: Sequence[Demonstrations]) -> tuple[Scene, np.ndarray]:
     """Training scenes, as many of every source, and their rows; numpy leaves."""
     each = [one.indices("train") for one in sources]
-    count = min(SPREAD_SCENES // len(each), *(index.size for index in each))
+    count = min(COMPARED_SCENES, *(index.size for index in each))
     rows = [index[np.linspace(0, index.size - 1, count).astype(int)] for index in each]
     parts = [one.read(some).scene for one, some in zip(sources, rows, strict=True)]
     scenes = jax.tree.map(lambda *x: np.concatenate(x), *parts)
@@ -111,20 +113,24 @@ def spread_scenes(sources: Sequence[Demonstrations]) -> tuple[Scene, np.ndarray]
 
 
 @functools.partial(jax.jit, static_argnames="score")
-def spread(
-    scenes: Scene, rows: jax.Array, score: Score, params: Params = None
-) -> jax.Array:
-    """Mean [] over scenes [S] of the deviation of a score over feasible candidates."""
+def unit_of(scenes: Scene, rows: jax.Array, score: Score) -> jax.Array:
+    """The unit [] of a cost, by the equation of `fitted_prior_cost`.
 
-    def one(item: tuple[Scene, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    Args:
+      scenes: [S] of logs.
+      rows: [S] of them in their dataset, which seed the candidates.
+      score: minus the cost.
+    """
+
+    def one(item: tuple[Scene, jax.Array]) -> jax.Array:
         scene = with_predicted_futures(item[0])
         scene = scene.replace(time_valid=jnp.ones_like(scene.time_valid))
         candidates = sample(candidates_key(item[1]), scene, ONLINE)
-        values = score(params, scene, candidates)
-        return jnp.std(values, where=candidates.feasible), jnp.any(candidates.feasible)
+        costs = -score(None, scene, candidates)
+        costs = jnp.where(candidates.feasible, costs, jnp.nan)
+        return jnp.nanquantile(costs, 0.25) - jnp.nanmin(costs)
 
-    found, counts = jax.lax.map(one, (scenes, rows))
-    return jnp.mean(found, where=counts)
+    return jnp.nanmedian(jax.lax.map(one, (scenes, rows)))
 
 
 def write_prior_cost(path: Path, prior_cost: PriorCost) -> None:
