@@ -21,7 +21,9 @@ _DATA = flags.DEFINE_list("data", None, "datasets, with commas", required=True)
 _WORKDIR = flags.DEFINE_string("workdir", None, "folder of the run", required=True)
 _RECIPE = flags.DEFINE_string("recipe", DEFAULT, "tuned, paper, quick or a TOML")
 _EPOCHS = flags.DEFINE_integer("epochs", None, "instead of the recipe's")
-_INCUMBENT = flags.DEFINE_string("incumbent", "hand-set", "weights file or baseline")
+_INCUMBENT = flags.DEFINE_string(
+    "incumbent", "hand-set", "weights file, own cost or baseline"
+)
 _SUITE = flags.DEFINE_string("suite", "full", "full, smoke, or families with commas")
 _CASES = flags.DEFINE_integer("cases", None, "per family; default: as declared")
 _DURATION = flags.DEFINE_float("duration", None, "s of a case; 120, of smoke 20")

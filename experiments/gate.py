@@ -18,7 +18,9 @@ from rcirl_jax.evaluation.closed_loop.likeness import DRIVES
 from rcirl_jax.runtime.executors import make_executor
 
 _CANDIDATE = flags.DEFINE_string("candidate", None, "weights file", required=True)
-_INCUMBENT = flags.DEFINE_string("incumbent", "hand-set", "weights file or baseline")
+_INCUMBENT = flags.DEFINE_string(
+    "incumbent", "hand-set", "weights file, own cost or baseline"
+)
 _OUTPUT = flags.DEFINE_string("output", None, "JSON to write", required=True)
 _DATA = flags.DEFINE_list("data", [], "datasets whose held-out drives are compared")
 _DRIVES = flags.DEFINE_integer("drives", DRIVES, "held-out drives in all")

@@ -149,7 +149,8 @@ def gate(
 
     Args:
       candidate: weights file.
-      incumbent: weights file, or a baseline's name.
+      incumbent: weights file, a baseline's name, or "FILE.py:FUNCTION" or
+        "FILE.so" of an own cost.
       data: datasets whose held-out drives measure its distance to people; without
         any that is not measured, and nothing ships.
       suite: as `simulate`; nothing ships on a part of "full".
@@ -253,7 +254,8 @@ def tune(
       data: folder of a dataset, or folders of several.
       workdir: folder of the run.
       recipe: as `train_reward`.
-      incumbent: what drives today: a weights file, or a baseline's name.
+      incumbent: what drives today: a weights file, a baseline's name, or
+        "FILE.py:FUNCTION" or "FILE.so" of an own cost.
       suite: cases of the closed loop: "full", "smoke", or families with commas.
       cases: of each family; None: as declared.
       duration_s: s of a case; None: 120, of "smoke" 20.

@@ -36,7 +36,8 @@ _CANDIDATE = flags.DEFINE_string(
 _INCUMBENT = flags.DEFINE_string(
     "incumbent",
     "hand-set",
-    "what drives today: a weights file, or a baseline: " + ", ".join(BASELINES),
+    "what drives today: a weights file, your own cost (FILE.py:FUNCTION or FILE.so), "
+    "or a baseline: " + ", ".join(BASELINES),
 )
 _OUTPUT = flags.DEFINE_string(
     "output", None, "JSON of the verdict to write", required=True

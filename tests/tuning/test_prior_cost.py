@@ -5,8 +5,10 @@ import types
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from rcirl_jax.features import feature_map
+from rcirl_jax.planner.own_cost import own_cost
 from rcirl_jax.reward.familiarity import familiarity, of_the_scene
 from rcirl_jax.tuning.prior_cost import (
     fit_familiarity,
@@ -93,3 +95,29 @@ def test_who_is_slow_on_an_empty_road_is_not_taken_for_recorded_traffic():
 
     assert gain(()) > 0.8
     assert gain((0.1, 0.2, 0.3)) < 0.4
+
+
+def test_gains_are_in_units_of_the_own_cost():
+    """A copy of the hand-set cost has its gains; a cost times 7 has 7 times those."""
+    config = PriorCostConfig(low=0.5, high=2.0)
+    scenes = batch([random_scene(seed) for seed in range(12)])
+    rows = types.SimpleNamespace(scene=jax.tree.map(np.asarray, scenes))
+    recorded = types.SimpleNamespace(
+        load=lambda split: rows,
+        indices=lambda split: np.arange(12),
+        read=lambda at: types.SimpleNamespace(
+            scene=jax.tree.map(lambda x: x[at], rows.scene)
+        ),
+    )
+    features = feature_map("paper21")
+
+    def made(name):
+        cost = own_cost(f"tests/planner/costs/costs.py:{name}")
+        return fitted_prior_cost(config, [recorded], [1.0], [recorded], features, cost)
+
+    copied, once, seven = map(made, ("copied", "headway_cost", "seven_and_three"))
+    assert (copied.incumbent, once.incumbent) == ("copied", "headway_cost")
+    assert (copied.low, copied.high) == pytest.approx((0.5, 2.0), rel=1e-5)
+    assert once.high == pytest.approx(4.0 * once.low)
+    assert 0.0 < once.high < 2.0
+    assert seven.high == pytest.approx(7.0 * once.high, rel=1e-3)
