@@ -10,19 +10,12 @@ is slower, and a crash or an endless loop ends in one line. `scene` and `candida
 is called back.
 """
 
-import contextlib
 import dataclasses
 import functools
 import hashlib
 import importlib.util
-import pickle
-import select
-import struct
-import subprocess
 import sys
 import threading
-import time
-import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -32,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError, did_you_mean
+from rcirl_jax.runtime.answering import AnsweringProcess, NoAnswer
 from rcirl_jax.types import Candidates, Scene
 
 CALL_S = 20.0  # s in which a process has to answer for a batch of scenes
@@ -167,7 +161,7 @@ class Processes:
 
     def __init__(self, place: str) -> None:
         self._place, self._lock = place, threading.Lock()
-        self._idle: list[subprocess.Popen] = []
+        self._idle: list[AnsweringProcess] = []
 
     def costs(self, given: dict) -> np.ndarray:
         """Computes the costs [..., K].
@@ -195,33 +189,17 @@ class Processes:
             self._fails(f"shape {costs.shape[1:]} for {feasible.shape[-1]} candidates")
         return costs.reshape(feasible.shape)
 
-    def _started(self) -> subprocess.Popen:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "rcirl_jax.planner.own_cost_process", self._place],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            bufsize=0,
-        )
-        weakref.finalize(self, _end, process)
+    def _started(self) -> AnsweringProcess:
+        program = [sys.executable, "-m", "rcirl_jax.planner.own_cost_process"]
+        process = AnsweringProcess([*program, self._place])
         self._asked(process, None, START_S)
         return process
 
-    def _asked(self, process: subprocess.Popen, given: object, limit: float) -> Any:  # noqa: ANN401
-        assert process.stdin is not None
-        text = pickle.dumps(given, protocol=5)
+    def _asked(self, process: AnsweringProcess, given: object, limit: float) -> Any:  # noqa: ANN401
         try:
-            left = memoryview(struct.pack("<Q", len(text)) + text)
-            while left:
-                left = left[process.stdin.write(left) :]
-            until = time.monotonic() + limit
-            (length,) = struct.unpack("<Q", _read(process, 8, until))
-            kind, made = pickle.loads(_read(process, length, until))
-        except TimeoutError:
-            process.kill()
-            self._fails(f"no answer in {limit:g} s")
-        except (EOFError, BrokenPipeError):
-            status = process.wait()
-            self._fails(f"its process ended with status {status}")
+            kind, made = process.ask(given, limit)
+        except NoAnswer as error:
+            self._fails(str(error))
         if kind != "costs":
             self._fails(made)
         return made
@@ -239,27 +217,6 @@ _making = threading.Lock()
 def _processes(cost: OwnCost) -> Processes:
     with _making:
         return _processes_of.setdefault(cost, Processes(cost.place))
-
-
-def _end(process: subprocess.Popen) -> None:
-    with contextlib.suppress(OSError):
-        process.kill()
-
-
-def _read(process: subprocess.Popen, size: int, until: float) -> bytes:
-    """Reads bytes of a process before a moment."""
-    assert process.stdout is not None
-    parts, left = [], size
-    while left:
-        wait = until - time.monotonic()
-        if wait <= 0.0 or not select.select([process.stdout], [], [], wait)[0]:
-            raise TimeoutError
-        part = process.stdout.read(left)
-        if not part:
-            raise EOFError
-        parts.append(part)
-        left -= len(part)
-    return b"".join(parts)
 
 
 def _plain(tree: Any) -> Any:  # noqa: ANN401
