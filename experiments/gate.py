@@ -14,7 +14,7 @@ from absl import flags
 
 import rcirl_jax
 from rcirl_jax.cli.running import run
-from rcirl_jax.evaluation.closed_loop.likeness import DRIVES
+from rcirl_jax.evaluation.gate.types import DRIVES
 from rcirl_jax.runtime.executors import make_executor
 
 _CANDIDATE = flags.DEFINE_string("candidate", None, "weights file", required=True)

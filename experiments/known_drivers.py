@@ -67,7 +67,10 @@ def tallied(runs: SuiteRuns, seeds: int, config: gate.GateConfig) -> list[dict]:
     found, size = [], len(runs.ids) // seeds
     for names in KINDS:
         same = dict.fromkeys((gate.CANDIDATE, names[1]), np.ones(MIN_CLUSTERS))
-        alike = gate.Likeness(distance=same, clusters=np.arange(MIN_CLUSTERS))
+        # rows that measure alike: the verdicts are about closed loop alone
+        alike = gate.Likeness(
+            distance=same, clusters=np.arange(MIN_CLUSTERS), available=MIN_CLUSTERS
+        )
         pair = gate.Pair(runs=runs, mine=names[0], name=names[1], likeness=alike)
         parts = [_part(runs, slice(i * size, (i + 1) * size)) for i in range(seeds)]
         pairs = [dataclasses.replace(pair, runs=part) for part in parts]

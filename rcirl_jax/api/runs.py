@@ -10,13 +10,12 @@ from rcirl_jax.api.logs import Place
 from rcirl_jax.api.training import folders_of, training_of
 from rcirl_jax.data.store.dataset import Dataset, Demonstrations, open_dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop.likeness import DRIVES
 from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteResult,
     write_suite,
 )
 from rcirl_jax.evaluation.closed_loop.summary import format_suite
-from rcirl_jax.evaluation.gate.types import GateConfig, Verdict
+from rcirl_jax.evaluation.gate.types import DRIVES, GateConfig, Verdict
 from rcirl_jax.evaluation.gate.verdict import write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
 from rcirl_jax.evaluation.ranking.evaluate import evaluate_ranking

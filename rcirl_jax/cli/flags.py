@@ -459,6 +459,7 @@ def margins() -> Callable[[], GateConfig]:
         "family_clean": "of the clean drives in one family",
         "progress": "of the incumbent's progress",
         "family_progress": "of its progress in one family",
+        "likeness": "farther from the human, share of the incumbent's distance",
         "gain": "of one primary metric, whatever is gained in another",
     }
     numbers = {

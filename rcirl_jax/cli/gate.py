@@ -19,7 +19,7 @@ from rcirl_jax.cli import flags as shared
 from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop.likeness import DRIVES
+from rcirl_jax.evaluation.gate.types import DRIVES
 from rcirl_jax.evaluation.gate.verdict import write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
 from rcirl_jax.export.closed_loop import gate_job, judged, read_tuned_idm

@@ -19,7 +19,6 @@ from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.dataset import JoinedDatasets, open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.likeness import (
-    DRIVES,
     LikenessReport,
     held_out_likeness,
 )
@@ -29,6 +28,7 @@ from rcirl_jax.evaluation.closed_loop.suite import (
     worst_cases,
     write_suite,
 )
+from rcirl_jax.evaluation.gate.types import DRIVES
 from rcirl_jax.export.closed_loop import SuiteJob, drive_by, read_tuned_idm
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.runtime.atomic_files import write_json, write_whole

@@ -19,7 +19,6 @@ import numpy as np
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.likeness import (
-    DRIVES,
     LikenessReport,
     held_out_likeness,
 )
@@ -33,6 +32,7 @@ from rcirl_jax.evaluation.closed_loop.suite import (
 )
 from rcirl_jax.evaluation.gate.types import (
     CANDIDATE,
+    DRIVES,
     INCUMBENT,
     GateConfig,
     Pair,

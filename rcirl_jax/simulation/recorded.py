@@ -102,6 +102,7 @@ class HeldOut:
     vehicle: np.ndarray  # [D] int, number of the ego, distinct over datasets
     recording: np.ndarray  # [D] int, number of the recording, likewise
     rows: Demonstration  # leaves [D, ...], numpy
+    available: int  # drives that the split has
 
 
 def held_out(
@@ -110,7 +111,7 @@ def held_out(
     """About `count` drives of a split, drawn evenly over datasets, recordings, egos.
 
     Args:
-      datasets: each gives its share, or all it has.
+      datasets: each gives as many as the others, or all it has.
       count: of all together.
       seed: of the draw.
       split: whose egos drive.
@@ -119,9 +120,12 @@ def held_out(
       InputError: no scene in the split.
     """
     parts, ids, vehicles, recordings = [], [], [], []
-    share = -(-count // max(len(datasets), 1))
-    for number, dataset in enumerate(datasets):
-        index = dataset.indices(split)
+    indices = [dataset.indices(split) for dataset in datasets]
+    sizes = np.array([index.size for index in indices])
+    share, enough = 1, min(count, sizes.sum())
+    while np.minimum(sizes, share).sum() < enough:
+        share += 1
+    for number, (dataset, index) in enumerate(zip(datasets, indices, strict=True)):
         if index.size == 0:
             continue
         recording, vehicle = (
@@ -145,6 +149,7 @@ def held_out(
         vehicle=np.concatenate(vehicles),
         recording=np.concatenate(recordings),
         rows=rows,
+        available=int(sizes.sum()),
     )
 
 

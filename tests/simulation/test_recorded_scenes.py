@@ -181,6 +181,7 @@ def test_distances_are_those_of_the_drives(tmp_path):
     back = read_arrays(tmp_path / "x.npz")
     assert isinstance(back, Likeness)
     np.testing.assert_array_equal(back.distance["coast"], coasted.distance)
+    assert back.available == 3
     with pytest.raises(InputError, match=r"none\.npz"):
         read_arrays(tmp_path / "none.npz")
 
@@ -194,11 +195,13 @@ def test_distances_are_those_of_the_drives(tmp_path):
         ("clusters", np.ones(3), "clusters: float64 (3,), not (3,)"),
         ("distance", -np.ones((2, 3)), "distance: below 0, NaN or infinity"),
         ("distance", None, "expected distances as written"),
+        ("available", np.array(0.5), "available: float64 (), not ()"),
     ],
 )
 def test_damaged_distances_are_one_line(tmp_path, name, array, says):
     good = {"names": np.array(["a", "b"]), "distance": np.ones((2, 3))}
-    arrays = {**good, "clusters": np.arange(3), name: array}
+    good |= {"clusters": np.arange(3), "available": np.array(3)}
+    arrays = {**good, name: array}
     arrays = {n: x for n, x in arrays.items() if x is not None}
     path = tmp_path / "x.npz"
     np.savez(path, **arrays)
@@ -222,6 +225,13 @@ def test_jensen_shannon_of_known_samples():
     assert jensen_shannon(a[:0], b[:0], "jerk") == 0.0
     nearly = np.random.default_rng(0).uniform(-8.0, 8.0, 10_000)
     assert 0.0 <= jensen_shannon(nearly, np.append(nearly[1:], 0.0), "jerk") < 0.01
+
+
+def test_a_dataset_with_few_drives_leaves_its_share_to_the_others():
+    drives = held_out([Rows(stored(3)), Rows(stored(1))], 4)
+    assert len(drives.ids) == drives.available == 4
+    two = held_out([Rows(stored(3)), Rows(stored(1))], 2).ids
+    assert [name[0] for name in two] == ["0", "1"]
 
 
 def test_a_split_without_scenes_is_one_line():

@@ -45,7 +45,6 @@ from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, firsts_first, human_r
 from rcirl_jax.simulation.suite import rollout_config
 from rcirl_jax.units import HORIZON_S
 
-DRIVES = 240  # held-out drives of a report, if not told otherwise
 TIMES_SHOWN_S = (1.0, 3.0, 5.0, 8.0)  # s at which distances are printed
 # what is compared as a distribution: lowest, highest, bins
 HISTOGRAMS: dict[str, tuple[float, float, int]] = {
@@ -77,6 +76,7 @@ class LikenessReport:
     ids: tuple[str, ...]
     clusters: np.ndarray  # [D] int, the ego's vehicle
     recordings: int
+    available: int  # held-out drives that there are
     references: tuple[str, ...] = REFERENCES  # rows that the others are compared with
 
     @property
@@ -88,7 +88,9 @@ class LikenessReport:
     @property
     def likeness(self) -> Likeness:
         """The distances in the form that the gate reads."""
-        return Likeness(distance=self.distance, clusters=self.clusters)
+        return Likeness(
+            distance=self.distance, clusters=self.clusters, available=self.available
+        )
 
     @functools.cached_property
     def facts(self) -> dict:
@@ -127,6 +129,7 @@ class LikenessReport:
             }
         return {
             "drives": len(self.ids),
+            "available": self.available,
             "vehicles": int(np.unique(self.clusters).size),
             "recordings": self.recordings,
             "rows": body,
@@ -181,7 +184,7 @@ def write_arrays(path: Path, known: Likeness) -> None:
     table = np.array(list(known.distance.values()), np.float64)
     names = np.array(list(known.distance))
     arrays = {"names": names, "distance": table, "clusters": known.clusters}
-    write_npz(path, arrays)
+    write_npz(path, {**arrays, "available": np.array(known.available)})
 
 
 def read_arrays(path: Path) -> Likeness:
@@ -194,11 +197,16 @@ def read_arrays(path: Path) -> Likeness:
         names = names_of_rows(arrays["names"])
         count = arrays["clusters"].size
         check_array(arrays, "clusters", "iu", (count,))
+        check_array(arrays, "available", "iu", ())
         check_array(arrays, "distance", "f", (len(names), count))
         if not np.all((arrays["distance"] >= 0.0) & (arrays["distance"] < np.inf)):
             raise ValueError("distance: below 0, NaN or infinity")
         distance = dict(zip(names, arrays["distance"], strict=True))
-        return Likeness(distance=distance, clusters=arrays["clusters"])
+        return Likeness(
+            distance=distance,
+            clusters=arrays["clusters"],
+            available=int(arrays["available"]),
+        )
 
 
 def jensen_shannon(a: np.ndarray, b: np.ndarray, name: str) -> float:
@@ -261,6 +269,7 @@ def held_out_likeness(
         ids=drives.ids,
         clusters=np.unique(drives.vehicle, return_inverse=True)[1],
         recordings=int(np.unique(drives.recording).size),
+        available=drives.available,
         references=tuple(dict.fromkeys((incumbent, *REFERENCES))),
     )
 

@@ -12,15 +12,18 @@ Six kinds of check, none of them on a learned reward:
                 families have to show it, so none is adjusted; a loss is detected
                 (exact McNemar, t) only after Holm over families
     trivial baselines   nearer to the human than rewards that know nothing, and as safe
-    likeness    not farther from the human than the incumbent, on held-out recorded
-                drives, paired by drive and clustered by vehicle
+    likeness    not farther from the human than the incumbent by a margin, on held-out
+                recorded drives, paired by drive and clustered by vehicle. Farther for
+                certain fails also within the margin: what passes was measured less than
+                half of the margin farther
     gain        better in one primary metric or in human-likeness, at least: McNemar
                 and families as clusters, Holm over them; and in no primary metric
                 worse by the same tests and more than a margin
 
 A check passes, fails, or is open: what was measured does not show it either way. Ship
-needs every check passed, a gain and the full suite; one failed check refuses; else,
-open checks, or a part of the suite only, make the gate unable to judge. A case with a
+needs every check passed, a gain, the full suite and the usual held-out drives; one
+failed check refuses; else, open checks, or a part only of what is to be driven, make
+the gate unable to judge. A case with a
 new fault that a person accepts no longer counts in the tests of safety.
 
 A gain is claimed for driving as such, so families count as draws from all kinds of
@@ -47,7 +50,6 @@ from rcirl_jax.evaluation.gate.types import (
     GateConfig,
     Kind,
     NewFault,
-    Outcome,
     Pair,
     Verdict,
 )
@@ -108,7 +110,8 @@ def judge(pair: Pair, config: GateConfig, part: str = "") -> Verdict:
     Args:
       pair: the drives.
       config: margins.
-      part: what was left out of the suite, in words; then nothing ships.
+      part: what was left out of the suite, in words; then nothing ships, nor where
+        held-out drives were left out.
 
     Raises:
       InputError: fewer than `MIN_CASES` cases, an accepted id that is no new fault,
@@ -117,13 +120,15 @@ def judge(pair: Pair, config: GateConfig, part: str = "") -> Verdict:
     count = len(pair.runs.ids)
     if count < MIN_CASES:
         raise InputError(f"gate: {count} cases: expected at least {MIN_CASES}")
+    drives = pair.likeness.left_out if pair.likeness else ""
+    part = "; ".join(filter(None, (part, drives)))
     faults = new_faults(pair, config.accept)
     checks = (
         *_no_more("safety", pair, pair.incumbent, config),
         *_no_loss(pair, config),
         *_families(pair, config),
         *_trivial_baselines(pair, config),
-        _likeness(pair),
+        _likeness(pair, config),
         *_gains(pair, config),
     )
     failed = [c for c in checks if c.outcome == "fail"]
@@ -140,7 +145,7 @@ def judge(pair: Pair, config: GateConfig, part: str = "") -> Verdict:
     reasons = reasons or ("no primary metric is better",)
     if part and decision == "ship":
         decision = "could not judge"
-        reasons = (f"{part}: nothing ships on a part of the suite", *reasons)
+        reasons = (f"{part}: nothing ships on a part", *reasons)
     verdict = Verdict(
         decision=decision,
         sentence="",
@@ -274,17 +279,16 @@ def _check(
     pairs: tuple[int, int] | None = None,
     p: float | None = None,
     note: str = "",
-    unclear: Outcome = "open",
 ) -> Check:
     """Makes a check of candidate minus the other; `fails` goes before `passes`.
 
-    `pairs` are (gained, lost) cases where those are counted, `unclear` is the outcome
-    of neither; the difference's own p is not the check's.
+    `pairs` are (gained, lost) cases where those are counted; the difference's own p is
+    not the check's.
     """
     gained, lost = pairs or (None, None)
     return Check(
         kind=kind, name=name, title=title,
-        outcome="fail" if fails else "pass" if passes else unclear,
+        outcome="fail" if fails else "pass" if passes else "open",
         difference=found.mean, low=found.low, high=found.high, margin=margin,
         gained=gained, lost=lost, p=p, note=note,
     )  # fmt: skip
@@ -459,20 +463,31 @@ def _nearer(pair: Pair, other: str) -> Difference | str:
 
 
 def _distance(
-    pair: Pair, kind: Kind, name: str, title: str, other: str, unclear: Outcome
+    pair: Pair, kind: Kind, name: str, title: str, other: str, margin: float | None
 ) -> Check:
-    """Compares the distance to the human with one row's."""
+    """Compares the distance to the human with one row's.
+
+    Args:
+      pair: the drives.
+      kind: of the check.
+      name: of the check.
+      title: of the check.
+      other: name of the row.
+      margin: share of that row's distance that the candidate may be farther; None:
+        it has to be nearer.
+    """
     found = _nearer(pair, other)
     if isinstance(found, str):
         return _unmeasured(kind, name, title, found)
-    fails, passes = found.high < 0.0, found.low > 0.0
-    return _check(kind, name, title, found, fails, passes, p=found.p, unclear=unclear)
+    fails, passes = found.high < 0.0, found.low > -(margin or 0.0)
+    numbers = {"margin": margin, "p": found.p}
+    return _check(kind, name, title, found, fails, passes, **numbers)
 
 
-def _likeness(pair: Pair) -> Check:
-    """Fails where the candidate is farther from the human than the incumbent."""
+def _likeness(pair: Pair, config: GateConfig) -> Check:
+    """Compares the distance to the human with the incumbent's, within its margin."""
     title = f"not farther from the human than {name_of(pair)}"
-    return _distance(pair, "likeness", "likeness", title, pair.name, "pass")
+    return _distance(pair, "likeness", "likeness", title, pair.name, config.likeness)
 
 
 def _trivial_baselines(pair: Pair, config: GateConfig) -> Iterator[Check]:
@@ -480,7 +495,7 @@ def _trivial_baselines(pair: Pair, config: GateConfig) -> Iterator[Check]:
     kind = "trivial baselines"
     for other in config.trivial_baselines:
         title = f"nearer to the human than {other}"
-        yield _distance(pair, kind, f"likeness, {other}", title, other, "open")
+        yield _distance(pair, kind, f"likeness, {other}", title, other, None)
     for other in config.trivial_baselines:
         if other in pair.runs.rows:
             yield from _no_more(kind, pair, pair.runs.rows[other], config, other)

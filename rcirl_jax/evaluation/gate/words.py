@@ -132,7 +132,7 @@ def sentence(pair: Pair, verdict: Verdict) -> str:
         names = {c.name for c in better}
         label = "Not told apart"
         undecided = [title for title, any_of in MAIN.items() if not names & any_of]
-        rest = [f"{cases} are too few to ship"]
+        rest = ["nothing ships on a part"]
     said = ""
     for details, crawling in DETAILS:
         losses = _listed([_worse(c, pair, crawling) for c in worse], details)
@@ -216,7 +216,7 @@ def _next(verdict: Verdict, worse: Sequence[Check], unclear: Sequence[Check]) ->
     if verdict.decision == "ship":
         return "look at the cases named below, then your own tests"
     if verdict.part:
-        return "drive the full suite"
+        return "drive what was left out"
     unsafe = any(c.kind in ("safety", "trivial baselines") for c in unclear)
     if unsafe and not all(fault.accepted for fault in verdict.new_faults):
         return "look at the new faults; --accept those that may stay"
@@ -255,7 +255,7 @@ def format_verdict(verdict: Verdict) -> str:
     lines += [line for said in verdict.reasons for line in _item(said)]
     lines += ["", f"{verdict.cases:,} cases of {verdict.families} families; % of cases"]
     if verdict.part:
-        lines += textwrap.wrap(f"a part of the suite: {verdict.part}", WIDTH)
+        lines += textwrap.wrap(f"a part only: {verdict.part}", WIDTH)
     header = ["", "", "difference", "95 %", "margin", "cases", "p"]
     for kind, title in TITLES.items():
         checks = [check for check in verdict.checks if check.kind == kind]

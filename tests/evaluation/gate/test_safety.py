@@ -1,5 +1,6 @@
 """Faults, accepted cases, trivial baselines and human-likeness in the gate."""
 
+import dataclasses
 import math
 import statistics
 
@@ -228,11 +229,62 @@ def test_the_interval_of_likeness_is_over_recordings():
     distance = dict(known.distance)
     factor = np.where(known.clusters == 0, 0.5, 1.0)
     distance["candidate"] = factor * np.asarray(distance["incumbent"])
-    verdict = judge_by(Likeness(distance=distance, clusters=known.clusters))
+    verdict = judge_by(dataclasses.replace(known, distance=distance))
     gains = [c for c in verdict.checks if c.kind == "gain" and c.name == "likeness"]
     assert gains[0].difference > 0.0
     assert gains[0].outcome == "open"
-    alone = Likeness(distance=distance, clusters=known.clusters % 3)
+    alone = dataclasses.replace(known, clusters=known.clusters % 3)
     few = judge_by(alone)
     assert few.decision == "could not judge"
     assert any("3 vehicles are too few" in reason for reason in few.reasons)
+
+
+def unlike(seed, count, farther):
+    """All drives that there are, which scatter as those of real rewards do.
+
+    With 240 the interval reaches 0.12 of the mean to each side.
+    """
+    rng = np.random.default_rng(seed)
+    hard = rng.lognormal(sigma=0.8, size=count)
+    distance = {
+        name: factor * hard * rng.lognormal(sigma=0.45, size=count)
+        for name, factor in (("candidate", 1.0 + farther), ("incumbent", 1.0))
+    }
+    clusters = np.arange(count) // 3 * 2 + np.arange(count) % 3 // 2
+    return Likeness(distance=distance, clusters=clusters, available=count)
+
+
+@pytest.mark.parametrize(("count", "least"), [(12, 0), (40, 0), (240, 6)])
+def test_what_is_farther_from_people_hardly_ever_ships(count, least):
+    """Of twenty draws each, as near as the incumbent and 5, 10 and 25 % farther."""
+    both = pair(smoother(drives()), drives())
+    config = GateConfig(trivial_baselines=(), primary=("j_station",))
+    shipped = [
+        sum(
+            judge(
+                dataclasses.replace(both, likeness=unlike(seed, count, farther)), config
+            ).decision
+            == "ship"
+            for seed in range(20)
+        )
+        for farther in (0.0, 0.05, 0.1, 0.25)
+    ]
+    assert shipped[0] >= least
+    most = (20, 3, 1, 0)
+    assert all(n <= limit for n, limit in zip(shipped, most, strict=True)), shipped
+
+
+@pytest.mark.parametrize(
+    ("driven", "available", "says"),
+    [(12, 2000, "12 held-out drives instead of 240"), (100, 100, ""), (240, 2000, "")],
+)
+def test_a_part_of_the_held_out_drives_does_not_ship(driven, available, says):
+    known = likeness(candidate=0.5)
+    some = Likeness(
+        distance={name: x[:driven] for name, x in known.distance.items()},
+        clusters=known.clusters[:driven],
+        available=available,
+    )
+    verdict = judge(pair(smoother(drives()), drives(), likeness=some), GateConfig())
+    assert verdict.part == says
+    assert verdict.decision == ("could not judge" if says else "ship")
