@@ -30,6 +30,7 @@ from rcirl_jax.evaluation.closed_loop.suite import (
     drive_here,
     run_suite,
 )
+from rcirl_jax.evaluation.gate.full_suite import families_sha256, left_out_of_suite
 from rcirl_jax.evaluation.gate.types import (
     CANDIDATE,
     DRIVES,
@@ -433,23 +434,23 @@ def judged(
     known = None if report is None else report.likeness
     pair = Pair(runs=result, name=incumbent, likeness=known)
     verdict = judge(pair, config, left_out(job))
-    return Judged(verdict=verdict, likeness=report, facts=result.facts)
+    facts = {**result.facts, **suite_facts(job)}
+    return Judged(verdict=verdict, likeness=report, facts=facts)
+
+
+def suite_facts(job: SuiteJob) -> dict[str, str]:
+    """Returns what a verdict states of the suite: the hash of its families' files."""
+    names = dict.fromkeys(ref.family for ref in job.refs)
+    return {"families_sha256": families_sha256(names)}
 
 
 def left_out(job: SuiteJob) -> str:
-    """Says which part of the full suite a job leaves out; "" if none."""
-    full = suite_refs("full")
-    ours = {dataclasses.replace(ref, seed=0).id for ref in job.refs}  # the same cases
-    missing = len({ref.id for ref in full} - ours)
-    said = []
-    if missing:
-        said.append(
-            f"{len(job.refs):,} cases, {missing:,} of the full suite's left out"
-        )
+    """Says how a job departs from the full suite; "" if it does not."""
+    said = [left_out_of_suite((ref.family, ref.index) for ref in job.refs)]
     if job.duration_s < FULL_S:
         said.append(f"cases of {job.duration_s:g} s instead of {FULL_S:g} s")
     if job.plan_every > 1:
         said.append(f"a plan every {job.plan_every * STEP_S:g} s instead of {STEP_S:g}")
     if job.track != "full":
         said.append("a safety filter that only forbids collisions")
-    return "; ".join(said)
+    return "; ".join(filter(None, said))

@@ -28,6 +28,7 @@ from rcirl_jax.export.closed_loop import (
     gate_job,
     left_out,
     read_tuned_idm,
+    suite_facts,
     write_tuned_idm,
 )
 from rcirl_jax.export.from_run import export_run
@@ -278,7 +279,8 @@ def gate(run: Run) -> Verdict:
     def work() -> None:
         files = {"candidate": str(run.weights), "incumbent": run.config.incumbent}
         runs = {"training_runs": run.config.seeds}
-        facts = {"files": files, **runs, "made_by": run.provenance()}
+        facts = {"files": files, **runs, **suite_facts(job)}
+        facts["made_by"] = run.provenance()
         write_verdict(path, verdict, run.config.gate, facts)
         drives = (run.folder / "likeness.txt").read_text()
         write_whole(run.tables, f"{drives}\n{format_verdict(verdict)}\n")
