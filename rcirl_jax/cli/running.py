@@ -54,6 +54,8 @@ SHORT = ("-h", "-?", "-help", "--help", "--helpshort")
 FULL = ("-helpfull", "--helpfull")
 WIDTH, INDENT = 100, 20  # columns of help
 LONGEST = 40  # characters of a default
+# flags of absl that end a command before its work, with status 0 or 1
+ENDING = ("only_check_args", "only_check_flags", "helpxml")
 FROM_FILE = "--flagfile=FILE reads flags from a file, one a line."
 flags.DEFINE_bool(
     "compilation_cache",
@@ -189,6 +191,13 @@ def flag_of(argument: str) -> str | None:
     return None
 
 
+class _Unknown(flags.ArgumentParser):
+    """Refuses every value: of flags that no command has."""
+
+    def parse(self, argument: object) -> NoReturn:
+        raise ValueError("expected a flag of the command")
+
+
 def _parse(main: Callable, argv: list[str]) -> list[str]:
     """Parses flags as absl does, with our help, and its complaints as one line.
 
@@ -200,6 +209,9 @@ def _parse(main: Callable, argv: list[str]) -> list[str]:
     if text := asked_for(argv, main):
         print(text)
         sys.exit(0)
+    for name in ENDING:
+        if name in flags.FLAGS:  # a newer absl has more of them
+            flags.FLAGS[name].parser = _Unknown()
     try:
         return flags.FLAGS(argv)
     except flags.Error as error:

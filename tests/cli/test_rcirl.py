@@ -232,6 +232,16 @@ def test_a_wrong_command_is_one_line(words, message, tmp_path):
 
 
 @pytest.mark.multiprocess
+@pytest.mark.parametrize("flag", ["only_check_args", "helpxml"])
+def test_no_flag_of_absl_ends_a_gate_before_its_verdict(flag, tmp_path):
+    """Also from a file: status 0 of a gate means "ship" and nothing else."""
+    (tmp_path / "flags").write_text(f"--{flag}\n")
+    given = ("gate", "--candidate=none", f"--output={tmp_path}/verdict.json")
+    for last in (f"--{flag}", f"--flagfile={tmp_path}/flags"):
+        assert f"--{flag}=true: expected a flag" in refused("rcirl_jax", *given, last)
+
+
+@pytest.mark.multiprocess
 def test_logs_of_no_known_format_are_one_line_with_the_formats(tmp_path):
     (tmp_path / "drive.log").write_bytes(b"\x00\x01")
     for words in ("import", "autotune"):
