@@ -21,7 +21,7 @@ from rcirl_jax.data.store.dataset import EQUAL, Demonstrations
 from rcirl_jax.data.store.splits import HOLDOUTS, folds_by_recording, held_out
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.baselines import SEARCHES
-from rcirl_jax.evaluation.gate.types import GateConfig
+from rcirl_jax.evaluation.gate.types import MAX_ACCEPTED, GateConfig
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW
 from rcirl_jax.reward import LOSSES
 from rcirl_jax.reward.network import CONSTRAINTS, SCALE_CONSTRAINTS
@@ -445,7 +445,8 @@ def margins() -> Callable[[], GateConfig]:
     accept = flags.DEFINE_list(
         "accept",
         [],
-        "ids of cases whose new fault a person has looked at, as cut_in/017@0",
+        f"ids of cases whose new fault a person has looked at, as cut_in/017@0; "
+        f"{MAX_ACCEPTED} at most",
     )
     texts = {
         "collision": "more cases with a preventable at-fault collision, share",

@@ -26,6 +26,7 @@ EXIT_CODES: dict[Decision, int] = {
     "could not judge": 2,
 }
 CANDIDATE, INCUMBENT = "candidate", "incumbent"  # names of rows
+MAX_ACCEPTED = 3  # cases; more than a person looks at are no exceptions
 DRIVES = 240  # held-out drives of a full run, or all there are
 
 
@@ -61,7 +62,7 @@ class GateConfig:
     primary: tuple[str, ...] = ("a_station", "j_station", "progress", "nuplan")
     # rows that the candidate has to be ahead of
     trivial_baselines: tuple[str, ...] = TRIVIAL_BASELINES
-    # cases with a new fault that a person has looked at and accepts
+    # cases with a new fault that a person has looked at and accepts, `MAX_ACCEPTED`
     accept: tuple[str, ...] = ()
 
     @property
@@ -78,6 +79,10 @@ class GateConfig:
         if not self.primary or not set(self.primary) <= set(known):
             bad = next((n for n in self.primary if n not in known), "none")
             raise InputError(f"primary: {bad}: expected some of {', '.join(known)}")
+        if len(self.accept) > MAX_ACCEPTED:
+            raise InputError(
+                f"accept: {len(self.accept)} cases: expected at most {MAX_ACCEPTED}"
+            )
         for flag in ("primary", "trivial_baselines", "accept"):
             names = getattr(self, flag)
             if len(set(names)) != len(names):

@@ -277,6 +277,7 @@ def test_few_families_are_said_in_words_and_intervals_stay_where_shares_can_be()
         ({"primary": ("reward",)}, "primary: reward: expected some"),
         ({"primary": ()}, "primary: none: expected some"),
         ({"accept": ("a/1@0", "a/1@0")}, "accept: a/1@0: met twice"),
+        ({"accept": tuple("abcd")}, "accept: 4 cases: expected at most 3"),
     ],
 )
 def test_bad_settings_are_one_line(wrong, says):

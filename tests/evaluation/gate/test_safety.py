@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import statistics
+import textwrap
 
 import numpy as np
 import pytest
@@ -165,6 +166,13 @@ def test_an_accepted_case_does_not_count():
     assert (check.outcome, check.lost) == ("pass", 3)
     assert verdict.decision == "ship"
     assert [fault.accepted for fault in verdict.new_faults] == [True] * 2 + [False] * 3
+    assert (
+        "the candidate loses nothing against the incumbent, but for accepted faults: "
+        f"{ids[0]} (preventable at-fault collision), {ids[1]} (pre" in verdict.sentence
+    )
+    named = decide(mine, theirs, accept=tuple(ids[:3])).sentence
+    assert all(case in named for case in ids[:3])
+    assert len(textwrap.wrap(named, 100)) <= 3
     some, none = f"expected some of {ids[0]}, ", "expected none, for there is none"
     for candidate, says in ((mine, some), (drives(), none)):
         with pytest.raises(InputError, match=f"accept: family01/000@1: .*{says}"):
