@@ -152,6 +152,9 @@ class CandidateInfo(flax.struct.PyTreeNode, kw_only=True):
     # log of the proposal's density at each trajectory, up to a constant per scene
     human_density: jax.Array  # [B]
     density: jax.Array  # [B, K]
+    # the own cost, negated and in its unit, where V is a residual on it; else 0
+    human_own: jax.Array  # [B]
+    own: jax.Array  # [B, K]
 
 
 class Demonstration(flax.struct.PyTreeNode, kw_only=True):

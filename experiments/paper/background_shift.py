@@ -157,6 +157,8 @@ def learn(loss: str, frames: Frames, start: jax.Array) -> Learned:
             breaks_rule=table,
             human_density=table[:, 0],
             density=table,
+            human_own=table[:, 0],
+            own=table,
         )
         compared = LossInputs(
             human=human @ used,

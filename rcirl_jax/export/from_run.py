@@ -1,6 +1,7 @@
 """A training run -> weights.msgpack with verification samples."""
 
 import datetime
+import math
 import os
 from pathlib import Path
 
@@ -10,10 +11,10 @@ import numpy as np
 
 from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.errors import MALFORMED, InputError
-from rcirl_jax.export.reader import PriorCost, Reward
+from rcirl_jax.export.reader import FAMILIARITY, PriorCost, Reward
 from rcirl_jax.export.weights import save
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.own_cost import OwnCost
+from rcirl_jax.planner.own_cost import OwnCost, is_place, own_cost
 from rcirl_jax.reward import (
     Normaliser,
     RewardModel,
@@ -22,6 +23,7 @@ from rcirl_jax.reward import (
     seen_range,
     value,
 )
+from rcirl_jax.reward.familiarity import familiar_nowhere
 from rcirl_jax.reward.network import LEAKY_SLOPE, layers_of
 from rcirl_jax.runtime.atomic_files import read_json
 from rcirl_jax.runtime.checked import typed_settings
@@ -91,7 +93,8 @@ def export_run(
       workdir: run folder of `rcirl train`.
       dataset: the dataset of the run (its hash has to match).
       output: file to write, atomically.
-      prior_cost: of a reward driven on top of an incumbent.
+      prior_cost: of a reward driven on top of an incumbent. That of a residual is
+        what was learned: V_total = beta own / unit + V drives as own + unit / beta V.
       own: the user's own cost, if that is the incumbent.
 
     Raises:
@@ -122,6 +125,11 @@ def export_run(
         "mode": config.sampler.mode,
         "config": run["config"],
     }
+    if config.residual_on:
+        own = own_cost(config.residual_on) if is_place(config.residual_on) else None
+        gain = config.own_unit / math.exp(float(np.asarray(state.params["log_beta"])))
+        name = own.name if own else config.residual_on
+        prior_cost = everywhere(name, gain, feature_map(config.features).num_features)
     if own is not None:
         place = os.path.abspath(own.place)
         provenance["own_cost"] = {"place": place, "sha256": own.sha256}
@@ -135,6 +143,14 @@ def export_run(
         seen,
         prior_cost=prior_cost,
     )
+
+
+def everywhere(incumbent: str, gain: float, size: int) -> PriorCost:
+    """Return a prior cost of `size` features with one gain for all scenes."""
+    known = familiar_nowhere(size)
+    arrays = {name: np.asarray(getattr(known, name)) for name in FAMILIARITY}
+    arrays["offset"] = arrays["offset"].reshape(1)
+    return PriorCost(incumbent=incumbent, low=gain, high=gain, **arrays)
 
 
 def write_weights(

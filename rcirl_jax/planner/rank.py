@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 
 from rcirl_jax.features import FeatureMap
-from rcirl_jax.planner.own_cost import OwnCost
+from rcirl_jax.planner.own_cost import OwnCost, own_cost
 from rcirl_jax.planner.plan import Plan, PreviousPlan, committed, either, plan_of
 from rcirl_jax.planner.safety import SafetyConfig, check, choose
 from rcirl_jax.reward.familiarity import familiar_nowhere, familiarity
@@ -163,6 +163,11 @@ OWN_SCORES: dict[str, Score] = {
     SPEED_DP_ROW: speed_dp_score,
     "+velocity": velocity_score,
 }
+
+
+def own_score(name: str) -> Score:
+    """The score of one of OWN_SCORES, or of the own cost at a place."""
+    return OWN_SCORES[name] if name in OWN_SCORES else own_cost(name).score
 
 
 class Ranking(flax.struct.PyTreeNode, kw_only=True):

@@ -13,6 +13,7 @@ product, which takes a CPU a third of the time of [K, T, F]. The parameters are
     point         of R_theta: {hidden_0: {kernel [F, H], bias [H]}, ..., out: {kernel}}
     scene_gating  [F, F] C, if the scene sets the gates g
     offset        [] the discriminator's threshold, of the GAN loss only; ranks nothing
+    log_beta      [] of V_total = beta own + V, where V is a residual on an own cost
 
 There is no output bias: it cancels between trajectories. Training changes raw
 parameters; `effective_params` are what V is made of, and what weights files hold.

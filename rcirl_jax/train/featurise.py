@@ -17,6 +17,7 @@ from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.features.columns import Frame
 from rcirl_jax.features.mapping import candidate_frames
 from rcirl_jax.planner.prediction import select_future, with_predicted_futures
+from rcirl_jax.planner.rank import own_score
 from rcirl_jax.planner.safety import check
 from rcirl_jax.reward import CandidateInfo
 from rcirl_jax.reward.network import matmul_f32
@@ -39,6 +40,7 @@ LANES = 16  # float32 numbers of the widest vectors of a CPU
 SAMPLER_STREAM = 0  # fold_in number of the sampler's key
 NEGATIVE_STREAM = 1  # fold_in number of the hard negatives' key
 FUTURES_STREAM = 2  # fold_in number of the draw between futures
+SLOWED_STREAM = 3  # fold_in number of the draw of the ego's speed
 OVER_LIMIT_MPS = 0.5  # m/s above the limit that counts as breaking it
 KERNEL_M = 2.0  # m, bandwidth of the proposal's density
 
@@ -85,6 +87,18 @@ def _under_futures(key: jax.Array, scene: Scene, futures: str) -> Scene:
     )
 
 
+def _slowed(key: jax.Array, scene: Scene, shares: tuple[float, ...]) -> Scene:
+    """Simulated scenes, half of them with a slower, steady ego. Key not consumed."""
+    if not shares:
+        return scene
+    every = jnp.asarray([*shares, *[1.0] * len(shares)])
+    draw = jax.random.fold_in(key, SLOWED_STREAM)
+    share = jnp.where(scene.tags[Tag.SIMULATED], jax.random.choice(draw, every), 1.0)
+    ego = scene.ego
+    slower = ego.replace(v=share * ego.v, a=jnp.where(share < 1.0, 0.0, ego.a))
+    return scene.replace(ego=slower)
+
+
 def featurise(
     key: jax.Array, batch: Batch, config: TrainConfig, features: FeatureMap
 ) -> FeatureBatch:
@@ -98,7 +112,8 @@ def featurise(
 
     def one(index: jax.Array, demonstration: Demonstration) -> tuple:
         own_key = jax.random.fold_in(key, index)
-        scene = _under_futures(own_key, demonstration.scene, config.futures)
+        scene = _slowed(own_key, demonstration.scene, config.slowed)
+        scene = _under_futures(own_key, scene, config.futures)
         demonstration = demonstration.replace(scene=scene)
         valid = demonstration.scene.time_valid & seen
         candidates = candidates_of(own_key, demonstration, config)
@@ -133,8 +148,17 @@ def featurise(
         choice = choice & admitted(demonstration.scene, candidates, config)
         near = jnp.argmin(jnp.where(choice, info.distance, jnp.inf))
         # what is nearer than the positive without being a choice is no worse than it
-        feasible = feasible & (choice | (info.distance > info.distance[near]))
-        feasible = feasible & jnp.any(choice)
+        counts = choice | (info.distance > info.distance[near])
+        if config.residual_on:
+            # where nobody was recorded, what the own cost chooses
+            own = own_score(config.residual_on)(None, scene, candidates)
+            own = own / config.own_unit
+            simulated = scene.tags[Tag.SIMULATED]
+            chosen = jnp.argmax(jnp.where(choice, own, -jnp.inf))
+            near = jnp.where(simulated, chosen, near)
+            counts = jnp.where(simulated, choice, counts)
+            info = info.replace(own=own, human_own=own[near])
+        feasible = feasible & counts & jnp.any(choice)
         info = with_densities(info, feasible)
         info = info.replace(
             human_distance=info.distance[near],
@@ -247,11 +271,11 @@ def not_finite(made: FeatureBatch, preset: str) -> dict[str, Any]:
         for i, name in enumerate(feature_map(preset).names)
     }
     info = made.info
-    of_each = np.asarray(info.distance + info.breaks_rule + info.density)
-    of_human = np.asarray(info.human_distance + info.human_density)
+    of_each = np.asarray(info.distance + info.breaks_rule + info.density + info.own)
+    of_human = np.asarray(info.human_distance + info.human_density + info.human_own)
     bad = (~np.isfinite(of_each) & np.asarray(made.feasible)).any(axis=-1)
     bad |= ~np.isfinite(of_human)
-    return {**found, "distance, density or broken rules of a candidate": bad}
+    return {**found, "distance, density, broken rules or own cost of a candidate": bad}
 
 
 def info_of(
@@ -280,6 +304,8 @@ def info_of(
         ),
         human_density=jnp.zeros(()),
         density=jnp.zeros(x.s.shape[:1]),
+        human_own=jnp.zeros(()),
+        own=jnp.zeros(x.s.shape[:1]),
     )
 
 

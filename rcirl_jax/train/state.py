@@ -120,6 +120,13 @@ class TrainConfig:
     # the others' future: "predicted" as in closed loop, "recorded" as in the paper, or
     # "both": drawn anew for each scene and step, so that V can be asked about either
     futures: str = "predicted"
+    # the cost that V is learned on: "" for none, "hand-set", the place of an own cost
+    # (`planner.own_cost`), or in a recipe "own cost", the incumbent's
+    residual_on: str = ""
+    # its unit (`tuning.prior_cost.unit_of`), from which the learned gain starts
+    own_unit: float = 1.0
+    # with it: shares of the ego's speed at which half of the simulated scenes are shown
+    slowed: tuple[float, ...] = ()
     # s, times after it are not compared, nor their weights learned
     train_horizon: float = 8.0
     # offline negatives near the human per scene (0: none)
@@ -144,6 +151,16 @@ class TrainConfig:
         for name, (low, high, text) in RANGES.items():
             if not low <= getattr(self, name) <= high:
                 raise InputError(f"{name}: {getattr(self, name)}: expected {text}")
+        if not all(0.0 <= share < 1.0 for share in self.slowed):
+            raise InputError(
+                f"slowed: {list(self.slowed)}: expected shares of the speed, each at "
+                "least 0 and below 1"
+            )
+        if self.residual_on and self.positive != "nearest":
+            raise InputError(
+                f"positive: {self.positive}: expected nearest with residual_on: an own "
+                "cost ranks what a planner could have driven"
+            )
         if self.loss == "listwise" and self.hard_negatives and self.hard_pool > 1:
             raise InputError(
                 f"hard_pool: {self.hard_pool}: expected 1 with loss=listwise: its "
@@ -168,6 +185,9 @@ class TrainConfig:
             train_horizon=self.train_horizon,
             hard_negatives=self.hard_negatives,
             hard_pool=self.hard_pool,
+            residual_on=self.residual_on,
+            own_unit=self.own_unit,
+            slowed=self.slowed,
             sampler=self.sampler,
         )
 

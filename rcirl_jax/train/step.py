@@ -74,6 +74,8 @@ def init_state(
     params = init_params(init_key, count, config.reward)
     if config.loss == "gan":
         params["offset"] = jnp.zeros(())
+    if config.residual_on:
+        params["log_beta"] = jnp.zeros(())
     made = TrainState.create(
         apply_fn=apply_of(config.reward),
         params=params,
@@ -198,6 +200,10 @@ def loss_inputs(
         human, candidates = jax.tree.map(lambda x: x[None], found)
     else:
         human, candidates = jax.vmap(siamese)(*scenes)
+    if "log_beta" in params:  # V is a residual: V_total = beta own + V
+        beta = jnp.exp(params["log_beta"])
+        human = human + beta * batch.info.human_own
+        candidates = candidates + beta * batch.info.own
     return LossInputs(
         human=human,
         candidates=candidates,

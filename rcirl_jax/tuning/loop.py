@@ -104,7 +104,7 @@ def _stages(
     yield "demonstrate"
     everything = with_simulated(run, sources, shares)
     yield "train"
-    train_seeds(run, everything)
+    train_seeds(run, everything, sources)
     run.say(_said_of_weights(run))
     yield "rank"
     rank(run, recorded)

@@ -29,7 +29,7 @@ from rcirl_jax.export.reader import PriorCost
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.planner.own_cost import OwnCost
 from rcirl_jax.planner.prediction import with_predicted_futures
-from rcirl_jax.planner.rank import ONLINE, Score, hand_score
+from rcirl_jax.planner.rank import ONLINE, Score, hand_score, own_score
 from rcirl_jax.reward.familiarity import (
     UNITS,
     Familiarity,
@@ -287,3 +287,31 @@ def prior_cost_file(run: Run, drives: int) -> Path | None:
     """Returns the file of the prior cost against so many sets of drives, or None."""
     wanted = run.config.prior_cost.wanted
     return run.folder / "prior_costs" / f"{drives}.json" if wanted else None
+
+
+def on_own_cost(run: Run, sources: Sequence[Dataset]) -> Run:
+    """Names the cost that V is a residual on, and its unit, if the recipe wants one.
+
+    The incumbent where it is an own cost, else the hand-set one.
+
+    Args:
+      run: folder and settings.
+      sources: what was recorded.
+    """
+    train, path = run.config.train, run.folder / "own_unit.json"
+    if not train.residual_on:
+        return run
+    place = run.config.incumbent if run.own_cost else OWN_COST
+    inputs = {
+        "own_cost": run.own_cost.sha256 if run.own_cost else OWN_COST,
+        "recorded": [one.hash for one in sources],
+    }
+
+    def work() -> None:
+        unit = float(unit_of(*some_scenes(sources), own_score(place)))
+        write_json(path, {"own_cost": place, "unit": unit})
+
+    run.stage("own unit", inputs, [path], work)
+    unit = float(read_json(path, "the unit of an own cost")["unit"])
+    train = dataclasses.replace(train, residual_on=place, own_unit=unit)
+    return dataclasses.replace(run, config=dataclasses.replace(run.config, train=train))

@@ -191,6 +191,15 @@ def load_recipe(name: str) -> Recipe:
             f"{path}: [{SIMULATED}] expert: none: expected one with a [prior_cost]: "
             "its drives show what was not recorded"
         )
+    if trained.residual_on:
+        where = f"{path}: [train] residual_on: {trained.residual_on}"
+        if trained.residual_on != "own cost":
+            raise InputError(f'{where}: expected "own cost", the incumbent\'s')
+        if prior_cost.wanted or simulated.rounds or not simulated.weight:
+            raise InputError(
+                f"{where}: expected no [prior_cost], and [{SIMULATED}] with a weight "
+                "above 0 and no rounds: they show where nobody was recorded"
+            )
     return Recipe(
         name=path.stem if name in known else name,
         about=str(body.get("about", "")),

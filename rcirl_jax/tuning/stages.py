@@ -45,7 +45,11 @@ from rcirl_jax.simulation.suite import recorded_set
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.metrics import pairs_won
 from rcirl_jax.train.state import FUTURES
-from rcirl_jax.tuning.prior_cost import prior_cost_file, read_prior_cost
+from rcirl_jax.tuning.prior_cost import (
+    on_own_cost,
+    prior_cost_file,
+    read_prior_cost,
+)
 from rcirl_jax.tuning.run import Run
 
 BASELINES = ("hand-set", "IDM", "random weights", *TRIVIAL_BASELINES)
@@ -57,13 +61,19 @@ RECORDED = 2  # held-out drives to play, of all sources
 # Training
 
 
-def train_seeds(run: Run, dataset: Demonstrations) -> None:
+def train_seeds(run: Run, dataset: Demonstrations, sources: Sequence[Dataset]) -> None:
     """Trains every seed, exports it; the median one becomes the candidate.
 
     That is the seed with the median share of training pairs won.
+
+    Args:
+      run: folder and settings.
+      dataset: what there is to learn from.
+      sources: of it, what was recorded.
     """
     files = run.seed_files
     prior = prior_cost_file(run, run.config.simulated.datasets)
+    run = on_own_cost(run, sources)
     for number, file in enumerate(files):
         train_one(run, f"train {number}", dataset, number, file, prior)
     steps = -(-dataset.indices("train").size // run.config.train.batch_size)

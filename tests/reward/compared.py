@@ -17,6 +17,8 @@ def compared(human, candidates, feasible=None, weight=None, offset=0.0, **info):
         "breaks_rule": jnp.zeros(shape),
         "human_density": jnp.zeros(shape[0]),
         "density": jnp.zeros(shape),
+        "human_own": jnp.zeros(shape[0]),
+        "own": jnp.zeros(shape),
     }
     return LossInputs(
         human=human,

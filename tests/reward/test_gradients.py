@@ -100,6 +100,7 @@ def drawn(name, config, seed):
         human_distance=as32(rng.uniform(0, 1, B)), human_collides=jnp.zeros(B, bool),
         distance=pairs(0, 20), collides=pairs(0, 1) < 0.3, breaks_rule=pairs(0, 1),
         human_density=as32(rng.normal(size=B)), density=pairs(-1, 1),
+        human_own=as32(rng.normal(size=B)), own=pairs(-1, 1),
     )  # fmt: skip
     counts = rng.random((B, K)) < 0.7
     counts[:, 0], counts[1] = True, False  # one scene has nothing to compare

@@ -149,7 +149,7 @@ def many(scenes=16, candidates=128):
     info = CandidateInfo(
         human_distance=of_scenes, human_collides=jnp.zeros(scenes, bool),
         distance=distance, collides=distance > 8.0, breaks_rule=of_pairs,
-        human_density=of_scenes, density=of_pairs,
+        human_density=of_scenes, density=of_pairs, human_own=of_scenes, own=of_pairs,
     )  # fmt: skip
     return FeatureBatch(
         human=jnp.asarray(around(scenes, *shape[2:]), jnp.float32),
