@@ -133,15 +133,14 @@ def sentence(pair: Pair, verdict: Verdict) -> str:
         label = "Not told apart"
         undecided = [title for title, any_of in MAIN.items() if not names & any_of]
         rest = ["nothing ships on a part"]
-    accepted = [fault for fault in verdict.new_faults if fault.accepted]
+    accepted = ", ".join(x.case for x in verdict.new_faults if x.accepted)
     said = ""
     for details, crawling in DETAILS:
         losses = _listed([_worse(c, pair, crawling) for c in worse], details)
         head = HEADS[decision]
         parts = [head.format(cases=cases, name=name_of(pair), losses=losses)]
         if accepted and not worse:
-            named = [_accepted(fault, brief=details == 1) for fault in accepted]
-            parts[0] += f", but for accepted faults: {', '.join(named)}"
+            parts[0] += f", but for accepted faults in {accepted}"
         if gains:
             words = "But better" if worse else "Better"
             parts.append(f"{words}: {_listed(gains, details)}")
@@ -225,12 +224,6 @@ def _next(verdict: Verdict, worse: Sequence[Check], unclear: Sequence[Check]) ->
     if unsafe and not all(fault.accepted for fault in verdict.new_faults):
         return "look at the new faults; --accept those that may stay"
     return f"{KEEP}, or drive more cases" if unclear else KEEP
-
-
-def _accepted(fault: NewFault, *, brief: bool) -> str:
-    """Returns an accepted case; unless brief, with its faults."""
-    faults = ", ".join(WORDS[name].one for name in fault.faults)
-    return fault.case if brief else f"{fault.case} ({faults})"
 
 
 def fault_words(fault: NewFault) -> str:

@@ -167,8 +167,8 @@ def test_an_accepted_case_does_not_count():
     assert verdict.decision == "ship"
     assert [fault.accepted for fault in verdict.new_faults] == [True] * 2 + [False] * 3
     assert (
-        "the candidate loses nothing against the incumbent, but for accepted faults: "
-        f"{ids[0]} (preventable at-fault collision), {ids[1]} (pre" in verdict.sentence
+        "the candidate loses nothing against the incumbent, but for accepted faults in "
+        f"{ids[0]}, {ids[1]}." in verdict.sentence
     )
     named = decide(mine, theirs, accept=tuple(ids[:3])).sentence
     assert all(case in named for case in ids[:3])
