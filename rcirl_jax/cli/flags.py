@@ -454,6 +454,7 @@ def margins() -> Callable[[], GateConfig]:
         "red_light": "with a red light run",
         "stop_sign": "with a stop sign run",
         "collision_free": "largest loss of fault-free cases, share",
+        "impact": "harder at-fault impacts, one of 10 m/s counts as one case, share",
         "min_ttc": "of cases above 0.95 s to collision",
         "speed_limit": "of cases within the limit",
         "on_road": "of cases on the road",

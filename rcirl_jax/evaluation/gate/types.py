@@ -27,6 +27,7 @@ EXIT_CODES: dict[Decision, int] = {
 }
 CANDIDATE, INCUMBENT = "candidate", "incumbent"  # names of rows
 MAX_ACCEPTED = 3  # cases; more than a person looks at are no exceptions
+IMPACT_MPS = 10.0  # m/s at which an at-fault impact counts as one
 DRIVES = 240  # held-out drives of a full run, or all there are
 
 
@@ -46,6 +47,8 @@ class GateConfig:
     # largest loss that counts as none: shares of all cases
     collision_free: float = 0.005  # at fault, preventable or not
     min_ttc: float = 0.01  # time to collision stays above 0.95 s
+    # at-fault impacts, each counted by its speed over `IMPACT_MPS`: share of all cases
+    impact: float = 0.0025
     speed_limit: float = 0.005
     on_road: float = 0.0025
     # clean drives, share of one family's cases; 180 cannot prove less than 0.021

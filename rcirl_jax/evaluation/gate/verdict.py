@@ -5,9 +5,9 @@ Six kinds of check, none of them on a learned reward:
     safety      not more cases with a preventable at-fault collision, a collision with
                 a pedestrian or cyclist, a red light or a stop sign run than the
                 incumbent, up to a declared margin
-    no loss     rates and progress over all cases are not worse than the incumbent's by
-                more than a margin: the lower end of the paired 95 % interval over
-                cases lies above it
+    no loss     rates, impact speeds and progress over all cases are not worse than the
+                incumbent's by more than a margin: the lower end of the paired 95 %
+                interval over cases lies above it
     families    in no family more clean drives or progress are lost than a margin. All
                 families have to show it, so none is adjusted; a loss is detected
                 (exact McNemar, t) only after Holm over families
@@ -45,6 +45,7 @@ from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, SuiteResult
 from rcirl_jax.evaluation.closed_loop.summary import result_hash
 from rcirl_jax.evaluation.gate.types import (
     CANDIDATE,
+    IMPACT_MPS,
     Check,
     Decision,
     GateConfig,
@@ -77,6 +78,7 @@ from rcirl_jax.simulation.suite import drive_row, rollout_config
 WORST = 20  # cases named for a person to look at
 MIN_CASES = 30  # below, no interval means anything
 MIN_CLUSTERS = 5  # families or vehicles below which no interval over them is made
+MIN_IMPACTS = 6  # unlike ones that can show a loss: 2^-6 < 2.5 %, the test's level
 MIN_FAMILY = 10  # cases of a family below which its interval means nothing
 LEVEL = 1.0 - CONFIDENCE  # of two-sided tests
 MATERIAL = 0.5  # share of a family's margin below which a loss of progress is small
@@ -316,6 +318,19 @@ def _progress(
     return mine / scale, theirs / scale
 
 
+def _impacts(pair: Pair, config: GateConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Returns [C], impact speeds of at-fault collisions over `IMPACT_MPS`, of both.
+
+    An accepted case counts 0.
+    """
+    counts = np.isin(pair.runs.ids, config.accept, invert=True)
+    mine, theirs = (
+        np.where(counts & (np.asarray(x.at_fault) > 0), np.asarray(x.impact_speed), 0.0)
+        for x in (pair.candidate, pair.incumbent)
+    )
+    return mine / IMPACT_MPS, theirs / IMPACT_MPS
+
+
 def _clipped(found: Difference, high: float = np.inf) -> Difference:
     """Returns the same with an interval that stays where a difference can be.
 
@@ -366,25 +381,30 @@ def _no_more(
 
 
 def _no_loss(pair: Pair, config: GateConfig) -> Iterator[Check]:
-    """Compares rates and progress of all cases, within their margins.
+    """Compares rates, impact speeds and progress of all cases, within their margins.
 
-    The suite's families are fixed: rates by Tango's interval over cases, progress by
+    The suite's families are fixed: rates by Tango's interval over cases, the others by
     Student's t within the families as strata.
     """
     mine, theirs = passes_of(pair.candidate), passes_of(pair.incumbent)
     count = len(pair.runs.ids)
-    for name in (*RATES, "progress"):
-        margin, pairs, note = config.margins[name], None, ""
+    strata = np.unique(pair.runs.groups, return_inverse=True)[1]
+    for name in (*RATES, "impact", "progress"):
+        margin, pairs, note, enough = config.margins[name], None, "", True
         if name == "progress":
-            strata = np.unique(pair.runs.groups, return_inverse=True)[1]
             found = _clipped(within_strata(*_progress(pair), strata))
+        elif name == "impact":
+            ours, others = _impacts(pair, config)
+            found = _clipped(within_strata(others, ours, strata))
+            enough = np.count_nonzero(ours != others) >= MIN_IMPACTS
         else:
             pairs = _discordant(mine[name], theirs[name])
             found = paired_rates(pairs, count)
             if paired_rates((0, 0), count).low <= -margin:
                 note = f"{count} cases can never prove a loss below {100 * margin:g} %"
         passes = found.low > -margin
-        fails, title = found.high < 0.0 and not passes, WORDS[name].title
+        fails = bool(found.high < 0.0 and not passes and enough)
+        title = WORDS[name].title
         numbers = {"margin": margin, "pairs": pairs, "note": note}
         yield _check("no loss", name, title, found, fails, passes, **numbers)
 

@@ -7,7 +7,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rcirl_jax.evaluation.closed_loop.summary import text_table
-from rcirl_jax.evaluation.gate.types import INCUMBENT, Check, NewFault, Pair, Verdict
+from rcirl_jax.evaluation.gate.types import (
+    IMPACT_MPS,
+    INCUMBENT,
+    Check,
+    NewFault,
+    Pair,
+    Verdict,
+)
 from rcirl_jax.simulation.families import family_title
 
 WIDTH = 100  # columns of wrapped text
@@ -55,6 +62,10 @@ WORDS = {
     "j_lateral": _holds("|lateral jerk| below 6 m/s³"),
     "min_ttc": _holds("more than 0.95 s to a collision"),
     "on_road": _holds("on the road"),
+    "impact": Words(
+        "speed of at-fault impacts",
+        "hits harder at fault, by {harder} m/s in 1,000 cases",
+    ),
     "progress": Words("progress", "makes {less} % less progress", "progress {more} %"),
     "nuplan": Words(
         "nuPlan's score",
@@ -187,6 +198,7 @@ def _numbers(check: Check) -> dict[str, object]:
         "fault": words.one if check.lost == 1 else words.title,
         "less": f"{-percent:.1f}",
         "more": f"{percent:+.1f}",
+        "harder": f"{-1000.0 * IMPACT_MPS * check.difference:.0f}",
     }
 
 

@@ -179,6 +179,33 @@ def test_an_accepted_case_does_not_count():
             decide(candidate, theirs, accept=("family01/000@1",))
 
 
+@pytest.mark.parametrize(
+    ("mine", "theirs", "outcome"),
+    [
+        ([30.0] * 10, [0.3] * 10, "fail"),
+        ([0.3] * 10, [30.0] * 10, "pass"),
+        ([5.0, 9.0, 2.0, 7.0], [8.0, 3.0, 6.0, 4.0], "pass"),
+        ([30.0], [], "pass"),
+        ([30.0] * 2, [], "open"),
+    ],
+)
+def test_a_harder_impact_counts_more(mine, theirs, outcome):
+    """Disjoint cases; a margin of ten of 10 m/s in 4,000 cases."""
+    both = []
+    for speeds, start in ((mine, 0), (theirs, 5)):
+        at = spread(len(speeds), start)
+        both.append(broken(drives(), at, at_fault=1, impact_speed=np.array(speeds)))
+    # who is hit by another may be hit hard
+    both[0] = broken(both[0], [90, 91], impact_speed=40.0)
+    verdict = decide(*both)
+    check = check_of(verdict, "impact")
+    assert check.outcome == outcome
+    total = (sum(theirs) - sum(mine)) / 10.0
+    assert check.difference == pytest.approx(total / CASES)
+    if outcome == "fail":
+        assert "hits harder at fault, by 74 m/s in 1,000 cases" in verdict.sentence
+
+
 # ------------------------------------------------ trivial baselines and likeness
 
 
