@@ -52,8 +52,8 @@ _SOURCE = flags.DEFINE_list(
 _INCUMBENT = flags.DEFINE_string(
     "incumbent",
     "hand-set",
-    "what drives today, to be compared with: a weights file, a baseline, or your own "
-    "cost, FILE.py:FUNCTION or FILE.so",
+    "what drives today, to be compared with: a weights file, a baseline, your own "
+    "cost, FILE.py:FUNCTION or FILE.so, or planner:COMMAND, a program that plans",
 )
 _SEEDS = flags.DEFINE_integer(
     "seeds", None, "training runs; the median one drives" + AS_SAID

@@ -2,6 +2,7 @@
 
     rcirl gate --candidate=FILE --incumbent=FILE --data=DATASET --output=verdict.json
     rcirl gate --candidate=FILE --incumbent=hand-set --output=verdict.json
+    rcirl gate --candidate="planner:./my_planner --flag" --output=verdict.json
 
 Both drive the same closed-loop cases; no learned reward judges. Refused (3)
 if the candidate has more cases with a fault than the incumbent, if rates or progress
@@ -31,13 +32,16 @@ USUAL = (
     *("duration", "tuned_idm", "accept", "primary", "workers"),
 )
 _CANDIDATE = flags.DEFINE_string(
-    "candidate", None, "weights file that may replace it", required=True
+    "candidate",
+    None,
+    "what may replace it: a weights file, or planner:COMMAND, a program that plans",
+    required=True,
 )
 _INCUMBENT = flags.DEFINE_string(
     "incumbent",
     "hand-set",
     "what drives today: a weights file, your own cost (FILE.py:FUNCTION or FILE.so), "
-    "or a baseline: " + ", ".join(BASELINES),
+    "planner:COMMAND, a program that plans, or a baseline: " + ", ".join(BASELINES),
 )
 _OUTPUT = flags.DEFINE_string(
     "output", None, "JSON of the verdict to write", required=True
@@ -86,6 +90,8 @@ def main() -> None:
     verdict = found.verdict
     files = {"candidate": _CANDIDATE.value, "incumbent": _INCUMBENT.value}
     facts = {"files": files, **found.facts, "made_by": provenance(job.weights)}
+    if job.planners:
+        facts["planners"] = job.programs()
     write_verdict(output, verdict, config, facts)
     print(format_verdict(verdict))
     print(f"written: {output}; exit status {verdict.exit_code}")

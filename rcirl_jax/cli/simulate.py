@@ -2,12 +2,15 @@
 
     rcirl simulate --weights=FILE[,FILE...] --suite=full|smoke|FAMILY --output=DIR
     rcirl simulate --weights=FILE --suite=recorded|heldout --data=DATASET --output=DIR
+    rcirl simulate --planner="./my_planner --flag" --suite=smoke --output=DIR
 
 Every case is driven at 10 Hz; safety filter and candidates are the same for all
 rows. Writes table.txt, suite.json and cases.csv. A case is drawn by `rcirl replay`
 from its id. Held-out drives of datasets, up to 8 s among the recorded traffic, have the
 recorded human as one of the rows: `recorded` says the same of them as of the other
-suites, `heldout` how near to the human each row is (table.txt and likeness.json).
+suites, `heldout` how near to the human each row is (table.txt and likeness.json). A
+planner is any program that speaks the protocol of docs/own_process.md: its plans are
+followed as they are, behind no filter of ours.
 """
 
 from pathlib import Path
@@ -29,7 +32,13 @@ from rcirl_jax.evaluation.closed_loop.suite import (
     write_suite,
 )
 from rcirl_jax.evaluation.gate.types import DRIVES
-from rcirl_jax.export.closed_loop import SuiteJob, drive_by, read_tuned_idm
+from rcirl_jax.export.closed_loop import (
+    SuiteJob,
+    checked_program,
+    drive_by,
+    read_tuned_idm,
+)
+from rcirl_jax.planner.program import processes_of
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
 from rcirl_jax.simulation.recorded import held_out
@@ -37,11 +46,12 @@ from rcirl_jax.simulation.rows import BASELINES, human_row
 from rcirl_jax.simulation.suite import case_duration, recorded_set, suite_refs
 
 USUAL = (
-    *("weights", "output", "suite", "cases", "duration", "data", "baselines"),
-    *("tuned_idm", "dp", "workers"),
+    *("weights", "planner", "output", "suite", "cases", "duration", "data"),
+    *("baselines", "tuned_idm", "dp", "workers"),
 )
-_WEIGHTS = flags.DEFINE_list(
-    "weights", None, "weights files, with commas", required=True
+_WEIGHTS = flags.DEFINE_list("weights", [], "weights files, with commas")
+_PLANNERS = flags.DEFINE_multi_string(
+    "planner", [], "command of a program that plans; may be given several times"
 )
 _DATA = flags.DEFINE_list(
     "data", [], "datasets of --suite=recorded or heldout, with commas"
@@ -83,7 +93,10 @@ def main() -> None:
         dp=_DP.value,
         tuned_idm=read_tuned_idm(Path(_IDM.value)) if _IDM.value else None,
         track=_FILTER.value,
+        planners=tuple(("", command) for command in _PLANNERS.value),
     )
+    for command in _PLANNERS.value:
+        checked_program(command)
     if said := shared.idm_left_out(_IDM.value):
         print(said)
     if of_data and places.workers > 1:
@@ -95,6 +108,8 @@ def main() -> None:
         raise InputError(f"--data: with --suite={suite}: expected {known}")
     # of the files as they are read, not hours later
     made_by, rows = provenance(_WEIGHTS.value), job.rows()
+    if job.planners:
+        made_by["planners"] = job.programs()
     if of_data:
         data = open_datasets(_DATA.value)
         made_by["data_hash"] = data.hash
@@ -112,6 +127,13 @@ def main() -> None:
     print(write_suite(result, Path(_OUTPUT.value), made_by))
     for name, facts in result.timings.items():
         print(f"{name}: {facts['seconds']} s, {facts['plans_per_s']:,} plans/s")
+    for row in rows:
+        if row.program and (times := processes_of(row.program).times())["answers"]:
+            print(
+                f"{row.name}: {times['answers']:,} answers, median "
+                f"{times['median_ms']:g} ms, 99 % in {times['p99_ms']:g} ms, longest "
+                f"{times['longest_ms']:g} ms; {times['failures']} failures"
+            )
     print(f"peak memory: {result.facts['peak_memory_gib']} GiB")
     print(f"look first at: {', '.join(worst_cases(result, rows[0].name, 5))}")
     print(f"written: {_OUTPUT.value}/table.txt, suite.json, cases.csv")

@@ -57,6 +57,7 @@ from rcirl_jax.planner.own_cost import (
     is_place,
     own_cost,
 )
+from rcirl_jax.planner.program import Program, check_program, is_program, program
 from rcirl_jax.planner.rank import (
     ONLINE,
     Params,
@@ -69,6 +70,8 @@ from rcirl_jax.planner.rank import (
     ranking_score,
 )
 from rcirl_jax.planner.safety import SafetyConfig
+from rcirl_jax.reward import RewardConfig, effective_params, init_params
+from rcirl_jax.reward.normaliser import identity_normaliser
 from rcirl_jax.runtime.atomic_files import read_json, write_json
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.runtime.executors import Executor
@@ -82,6 +85,7 @@ from rcirl_jax.simulation.rows import (
     Row,
     baseline_row,
     judges,
+    program_row,
     rule_row,
 )
 from rcirl_jax.simulation.suite import (
@@ -95,8 +99,10 @@ from rcirl_jax.simulation.suite import (
     rollout_config,
     suite_refs,
 )
+from rcirl_jax.types import Normaliser, RewardParams
 
 DP_EVERY = 10  # steps between two plans of the DP row: it costs 1,000 rankings
+NO_WEIGHTS = "paper21"  # features of "random weights" in a table without any
 FIELDS = tuple(field.name for field in dataclasses.fields(Idm))
 _POSITIVE = Annotated[float, msgspec.Meta(gt=0.0, lt=1e6)]
 _IDM = msgspec.defstruct(
@@ -153,42 +159,65 @@ def table_rows(
     names: Sequence[str] = (),
     track: str = "full",
     own: str = "",
+    planners: Sequence[tuple[str, str]] = (),
 ) -> list[Row]:
-    """Learned rows first, in the order of the files, then the baselines.
+    """Learned rows first, in the order of the files, planners, then the baselines.
 
     Rows are named as by `row_names`, or bear `names`, one per file. The first drives
     again by `dp`. A tuned IDM comes last. `track` is the safety filter's
     (`SafetyConfig`), `own` the place of the user's own cost, a baseline by its name.
+    `planners` are names of rows ("" for a program's own) and `planner.program` places.
 
     Raises:
-      InputError: no file, an unreadable one, one twice without `names`, path_speed
-        weights, or an unknown baseline.
+      InputError: no file and no planner, an unreadable one, one twice without `names`,
+        path_speed weights, an unknown baseline, a planner that cannot be started or is
+        called as another row.
     """
-    if not weights:
-        raise InputError("weights: none: expected at least one file")
+    if not weights and not planners:
+        raise InputError("weights: none: expected at least one file or planner")
     rewards = [open_reward(path) for path in weights]
     user = own_cost_of(rewards, own)
     config = RankConfig(safety=SafetyConfig(track=track), own=user)
     rows = _learned_rows(rewards, names, config)
-    first = rewards[0]
-    preset, params = str(first.preset), reward_params(first)
-    if dp and first.prior_cost is not None:
+    first = rewards[0] if rewards else None
+    preset, params, activation = _program_of(first)
+    if dp and first is None:
+        raise InputError("dp: without weights: expected a weights file")
+    if dp and first is not None and first.prior_cost is not None:
         raise InputError(
             f"dp: {first.file}: expected a reward without a prior cost: the own cost "
             "is no sum over points"
         )
     if dp:
-        policy = dp_policy(feature_map(preset), first.activation, config, DpConfig())
+        policy = dp_policy(feature_map(preset), activation, config, DpConfig())
         every, name = max(plan_every, DP_EVERY), f"{rows[0].name} DP"
         row = Row(name=name, policy=policy, params=params, plan_every=every)
         rows.insert(1, row)
+    rows += [program_row(program(place), name) for name, place in planners]
     rows += [
-        baseline_row(name, preset, params, config, first.activation)
-        for name in baselines
+        baseline_row(name, preset, params, config, activation) for name in baselines
     ]
     if tuned_idm is not None:
         rows.append(rule_row(TUNED_IDM_ROW, "IDM", Yielding(idm=tuned_idm)))
+    called = [row.name for row in rows]
+    for row in rows:
+        if row.program is not None and called.count(row.name) > 1:
+            raise InputError(
+                f"planner: {row.program.command}: it is called {row.name}: expected "
+                "another name than other rows'"
+            )
     return rows
+
+
+def _program_of(
+    reward: Reward | None,
+) -> tuple[str, tuple[RewardParams, Normaliser], str]:
+    """Preset, weights and activation by whose program baselines are ranked."""
+    if reward is not None:
+        return str(reward.preset), reward_params(reward), reward.activation
+    shape, count = RewardConfig(), feature_map(NO_WEIGHTS).num_features
+    drawn = effective_params(init_params(jax.random.key(0), count, shape), shape)
+    return NO_WEIGHTS, (drawn, identity_normaliser(count)), shape.activation
 
 
 def _learned_rows(
@@ -223,10 +252,12 @@ class SuiteJob:
     tuned_idm: Idm | None = None  # of a further row
     track: str = "full"  # of the safety filter
     own: str = ""  # place of the user's own cost
+    # programs that plan: names of their rows, "" for their own, and commands
+    planners: tuple[tuple[str, str], ...] = ()
 
     def rows(self) -> list[Row]:
-        """Learned rows, then the baselines."""
-        return table_rows(
+        """A gate's candidate, learned rows, planners, then the baselines."""
+        rows = table_rows(
             self.weights,
             self.baselines,
             self.plan_every,
@@ -235,7 +266,14 @@ class SuiteJob:
             track=self.track,
             tuned_idm=self.tuned_idm,
             own=self.own,
+            planners=self.planners,
         )
+        return sorted(rows, key=lambda row: row.name != CANDIDATE)
+
+    def programs(self) -> dict[str, dict[str, str]]:
+        """The programs that plan, by command, for provenance."""
+        found = [program(place) for _, place in self.planners]
+        return {one.command: {"name": one.name, "sha256": one.sha256} for one in found}
 
     def cases(self) -> CaseSet:
         """The cases of the catalogue."""
@@ -325,9 +363,9 @@ def gate_job(
     """The suite that both drive, and the name of the incumbent's row.
 
     Args:
-      candidate: weights file.
-      incumbent: weights file, name of a baseline, or place of an own cost
-        (`planner.own_cost`).
+      candidate: weights file, or a program that plans (`planner.program`).
+      incumbent: weights file, name of a baseline, place of an own cost
+        (`planner.own_cost`), or a program that plans.
       suite: full, smoke, or families with commas.
       cases: per family; None: as declared.
       duration_s: of a case; None: 120 s, smoke 20 s.
@@ -344,14 +382,21 @@ def gate_job(
     if is_place(incumbent):
         own = incumbent
         incumbent = checked_own_cost(own).name
-    learned = not own and incumbent not in BASELINES
+    named = {CANDIDATE: candidate, INCUMBENT: incumbent}
+    planners = {name: x for name, x in named.items() if is_program(x)}
+    for place in planners.values():
+        checked_program(place)
+    learned = not own and incumbent not in (*BASELINES, *planners.values())
     if learned and not Path(incumbent).is_file():
         raise InputError(
             f"incumbent: {incumbent}: expected a weights file, FILE.py:FUNCTION or "
-            f"FILE.so of an own cost, or one of {', '.join(BASELINES)}"
+            f"FILE.so of an own cost, planner:COMMAND, or one of "
+            f"{', '.join(BASELINES)}"
         )
-    names = [*baselines] if learned else [incumbent, *baselines]
+    theirs = learned or INCUMBENT in planners
+    names = [*baselines] if theirs else [incumbent, *baselines]
     files = {CANDIDATE: candidate, **({INCUMBENT: incumbent} if learned else {})}
+    files = {name: x for name, x in files.items() if name not in planners}
     job = SuiteJob(
         weights=tuple(files.values()),
         names=tuple(files),
@@ -362,8 +407,9 @@ def gate_job(
         tuned_idm=tuned_idm,
         track=track,
         own=own,
+        planners=tuple(planners.items()),
     )
-    return job, INCUMBENT if learned else incumbent
+    return job, INCUMBENT if theirs else incumbent
 
 
 CHECKED_PER_FAMILY = 10  # scenes of a family that an own cost is asked about
@@ -384,6 +430,22 @@ def checked_own_cost(place: str) -> OwnCost:
     candidates = draw(keys, scenes)
     check_own_cost(cost, scenes, candidates, BASELINES)
     return cost
+
+
+@functools.cache
+def checked_program(place: str) -> Program:
+    """The program at a place, asked about the first scene of every family.
+
+    Raises:
+      InputError: there is none, or an answer that is no plan.
+    """
+    one = program(place)
+    refs = suite_refs("smoke", 1)
+    catalogue_set(refs, 1.0)  # says how the cases are called
+    cases = build(refs, 1.0)
+    scenes = jax.tree.map(np.asarray, first_scenes(cases))
+    check_program(one, scenes, np.asarray(cases.seed))
+    return one
 
 
 def drive_job(job: SuiteJob, executor: Executor) -> SuiteResult:
@@ -432,6 +494,8 @@ def judged(
         recorded = held_out(sources, drives)
         report = held_out_likeness(recorded, job.rows(), job.plan_every, incumbent)
     known = None if report is None else report.likeness
+    if report and any(report.rows[x].not_driven for x in (CANDIDATE, incumbent)):
+        known = None  # its text says how many drives there are no distances of
     pair = Pair(runs=result, name=incumbent, likeness=known)
     verdict = judge(pair, config, left_out(job))
     facts = {**result.facts, **suite_facts(job)}

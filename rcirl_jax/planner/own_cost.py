@@ -43,7 +43,8 @@ _failed: dict[str, str] = {}  # place -> line on why its process gave no costs
 
 def is_place(name: str) -> bool:
     """True for what names an own cost: FILE.py:FUNCTION or a library FILE.so."""
-    return name.endswith(".so") or ".py:" in name
+    is_program = name.startswith("planner:")
+    return not is_program and (name.endswith(".so") or ".py:" in name)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -103,6 +103,11 @@ def case_id(family: str, index: int, seed: int) -> str:
     return f"{family}/{index:03d}@{seed}"
 
 
+def case_number(name: str) -> int:
+    """`Case.seed` of a case by its id."""
+    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big")
+
+
 def parse_case_id(text: str) -> tuple[str, int, int]:
     """(family, index, seed) of a case's name.
 
@@ -318,11 +323,10 @@ def _built(family: Family, index: int, seed: int, duration_s: float) -> Case:
             )
     parts = _events(family, draws, shared, road, rng, index, seed)
     _check(family, case_id(family.name, index, seed), road, parts)
-    stream = hashlib.sha256(case_id(family.name, index, seed).encode()).digest()
     f = np.float32
     return node(
         Case,
-        seed=np.uint32(int.from_bytes(stream[:4], "big")),
+        seed=np.uint32(case_number(case_id(family.name, index, seed))),
         steps=np.int32(round(duration_s / STEP_S)),
         ego_v=f(road["ego_speed"]),
         ego_length=f(EGO_LENGTH_M),

@@ -114,6 +114,30 @@ class CaseMetrics(flax.struct.PyTreeNode, kw_only=True):
     comfort: jax.Array  # 0 or 1
 
 
+def without_lost(metrics: CaseMetrics) -> CaseMetrics:
+    """Puts numbers in place of drives [C] that are at no number: not driven.
+
+    Such a case has no samples, holds no bound, makes no progress and has no score.
+
+    Args:
+      metrics: leaves [C, ...], numpy.
+    """
+    lost = ~np.isfinite(metrics.progress) | ~np.isfinite(metrics.mean_speed)
+    stands = {"min_ttc": np.inf, "min_headway": np.inf, "min_clearance": np.inf}
+    stands = {**stands, "start_time": -1.0}
+    values = {}
+    for name, value in vars(metrics).items():
+        value = np.asarray(value)
+        at = lost.reshape(-1, *[1] * (value.ndim - 1))
+        values[name] = np.where(at, value.dtype.type(stands.get(name, 0)), value)
+    return CaseMetrics(**values)
+
+
+def not_driven(metrics: CaseMetrics) -> np.ndarray:
+    """[C] bool: cases that were not driven, as `without_lost` has them."""
+    return np.asarray(metrics.samples) == 0
+
+
 def differences(x: jax.Array) -> jax.Array:
     """Plain rate of change [S] per second at 10 Hz; the first sample has none."""
     return jnp.diff(x, prepend=x[:1]) / STEP_S

@@ -104,6 +104,11 @@ class HeldOut:
     rows: Demonstration  # leaves [D, ...], numpy
     available: int  # drives that the split has
 
+    @property
+    def names(self) -> dict[int, str]:
+        """The ids by the numbers of the cases."""
+        return dict(zip(np.asarray(self.cases.seed).tolist(), self.ids, strict=True))
+
 
 def held_out(
     datasets: Sequence[Dataset], count: int, seed: int = 0, split: str = "test"

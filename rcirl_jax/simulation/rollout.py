@@ -2,7 +2,8 @@
 
 The only file of the simulator that names `jit`, `vmap` or `scan` over cases and time.
 A policy is a pure function `(params, scene, key, before) -> Plan`, `before` being the
-plan in force; between two plans the ego follows the plan.
+plan in force; between two plans the ego follows the plan. One with a method `in_case`
+is given number and step of the case besides.
 
 What is compiled is a span of half a second for a group of cases. Longer drives are the
 same program called again, so that one serves the suite, held-out drives, demonstrations
@@ -185,16 +186,19 @@ def _compiled(policy: Policy, plan_every: int, length: int, vehicle: Vehicle) ->
         stream = lambda seed: jax.random.fold_in(jax.random.key(seed), SAMPLER_STREAM)  # noqa: E731
         keys = jax.vmap(stream)(cases.seed)
 
-        def plan_of(scene: Scene, key: jax.Array, world: World, before: Plan) -> Plan:
+        def plan_of(
+            scene: Scene, key: jax.Array, world: World, before: Plan, seed: jax.Array
+        ) -> Plan:
+            key = jax.random.fold_in(key, world.step)
             with jax.named_scope("policy"):
-                return policy(
-                    params, scene, jax.random.fold_in(key, world.step), before
-                )
+                if in_case := getattr(policy, "in_case", None):
+                    return in_case(params, scene, key, before, seed, world.step)
+                return policy(params, scene, key, before)
 
         def plan_and_drive(now: Now, _: None) -> tuple[Now, jax.Array]:
             scenes = jax.vmap(observe)(cases, now.worlds, limits)
             now = now.replace(
-                plan=jax.vmap(plan_of)(scenes, keys, now.worlds, now.plan)
+                plan=jax.vmap(plan_of)(scenes, keys, now.worlds, now.plan, cases.seed)
             )
             drive = jax.vmap(tick, in_axes=(0, None, 0))
             return jax.lax.scan(

@@ -28,6 +28,7 @@ from rcirl_jax.planner.baselines import (
     rule,
     rule_policy,
 )
+from rcirl_jax.planner.program import Program, ProgramPolicy
 from rcirl_jax.planner.rank import (
     Params,
     Policy,
@@ -66,6 +67,11 @@ class Row:
     # seed of the training run, where rows of one name differ by it
     seed: int = 0
 
+    @property
+    def program(self) -> Program | None:
+        """The user's program that plans, where one does."""
+        return getattr(self.policy, "program", None)
+
 
 def learned_row(
     name: str,
@@ -87,6 +93,11 @@ def rule_row(
 ) -> Row:
     """A driver model of `RULES`, with its constants; `how` are fields of `Row`."""
     return Row(name=name, policy=rule_policy, params=rule(of, driver), **how)
+
+
+def program_row(one: Program, name: str = "") -> Row:
+    """A planner that is a program, under its own name or another."""
+    return Row(name=name or one.name, policy=ProgramPolicy(one))
 
 
 def human_row() -> Row:

@@ -17,16 +17,23 @@ import jax
 import numpy as np
 
 from rcirl_jax.errors import InputError, did_you_mean
+from rcirl_jax.planner.program import name_cases
 from rcirl_jax.simulation.cases import STEP_S, Case, Record, Snapshot
 from rcirl_jax.simulation.catalogue import (
     build_cases,
     case_id,
+    case_number,
     family_names,
     load_family,
     parameters_of,
     parse_case_id,
 )
-from rcirl_jax.simulation.metrics import CaseMetrics, MetricsConfig, case_metrics
+from rcirl_jax.simulation.metrics import (
+    CaseMetrics,
+    MetricsConfig,
+    case_metrics,
+    without_lost,
+)
 from rcirl_jax.simulation.recorded import DATASET, HeldOut
 from rcirl_jax.simulation.rollout import LANES, RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import Row
@@ -143,6 +150,7 @@ class CaseSet:
 
 def catalogue_set(refs: Sequence[CaseRef], duration_s: float) -> CaseSet:
     """Cases of the catalogue."""
+    name_cases({case_number(ref.id): ref.id for ref in refs})
     drawn = [parameters_of(load_family(r.family), r.index, r.seed) for r in refs]
     return CaseSet(
         ids=tuple(ref.id for ref in refs),
@@ -155,6 +163,7 @@ def catalogue_set(refs: Sequence[CaseRef], duration_s: float) -> CaseSet:
 
 def recorded_set(drives: HeldOut) -> CaseSet:
     """Held-out drives of datasets; grouped by recording, "DATASET:RECORDING"."""
+    name_cases(drives.names)
     return CaseSet(
         ids=drives.ids,
         groups=tuple(
@@ -202,7 +211,11 @@ def drive_with_logs(
     made, (record, shots, _) = drive_cases(
         row.policy, row.params, full, config, _reduced, keep=True
     )
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], (made, record, shots))
+    logs = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], (made, record, shots))
+    if row.program is None:
+        return logs
+    made, *others = logs
+    return without_lost(made), *jax.tree.map(np.nan_to_num, others)
 
 
 def drive_row(
@@ -233,6 +246,8 @@ def drive_row(
         fill = np.minimum(np.arange(size), count - 1)
         full = jax.tree.map(lambda leaf, f=fill: np.asarray(leaf)[f], cases)
         found = drive_cases(row.policy, row.params, full, config, _reduced)
+        if row.program is not None:
+            found = without_lost(found)
         parts.append(jax.tree.map(lambda leaf, n=count: np.asarray(leaf)[:n], found))
         if progress is not None:
             progress(count)

@@ -33,6 +33,7 @@ from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.sweep import read_sweep
 from rcirl_jax.planner.own_cost import OwnCost, is_place
+from rcirl_jax.planner.program import is_program, program
 from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.runtime.pipeline import Stages, code_sha256, file_sha256
 from rcirl_jax.simulation.rows import BASELINES
@@ -180,9 +181,10 @@ class Run:
         return {**self.facts, "weights_sha256": {r.file: r.sha256 for r in rewards}}
 
     def incumbent_reward(self) -> Reward | None:
-        """The incumbent's reward; None: a baseline or an own cost."""
+        """The incumbent's reward; None: a baseline, an own cost or a program."""
         name = self.config.incumbent
-        return None if name in BASELINES or is_place(name) else open_reward(name)
+        other = name in BASELINES or is_place(name) or is_program(name)
+        return None if other else open_reward(name)
 
     @property
     def own_cost(self) -> OwnCost | None:
@@ -195,4 +197,6 @@ class Run:
         name = self.config.incumbent
         if self.own_cost:
             return self.own_cost.sha256
+        if is_program(name):
+            return program(name).sha256
         return name if name in BASELINES else file_sha256(Path(name))

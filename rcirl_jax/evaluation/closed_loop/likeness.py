@@ -37,6 +37,7 @@ from rcirl_jax.evaluation.statistics import (
     combine_seeds,
     paired_difference,
 )
+from rcirl_jax.planner.program import name_cases
 from rcirl_jax.runtime.executors import two_at_a_time
 from rcirl_jax.simulation.cases import STEP_S, Record
 from rcirl_jax.simulation.recorded import STEPS, HeldOut
@@ -66,6 +67,7 @@ class Driven:
     induced_braking: np.ndarray  # [D] m/s^2, hardest that the ego caused
     crashed: np.ndarray  # [D] bool, at fault
     samples: Mapping[str, np.ndarray]  # of HISTOGRAMS, all drives' in one
+    not_driven: int = 0  # drives in which a program gave no plan: it stands there
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -119,6 +121,7 @@ class LikenessReport:
                 "speed_share": float(np.mean(row.mean_speed) / human.mean_speed.mean()),
                 "induced_braking_mps2": float(np.mean(row.induced_braking)),
                 "crashed": int(np.sum(row.crashed)),
+                "not_driven": row.not_driven,
                 "minus": {
                     other: dataclasses.asdict(
                         paired_difference(row.distance, found[other], bootstrap)
@@ -164,6 +167,11 @@ class LikenessReport:
             *text_table(head, rows),
             "distance: mean of |s - s_human|, and at 1 to 8 s; speed: share of the "
             "human's; a to TTC: how unlike the human's distribution, 0 to 1",
+            *(
+                f"{name}: {row.not_driven} drives not driven: it stands there"
+                for name, row in self.rows.items()
+                if row.not_driven
+            ),
             "",
         ]
         if known:
@@ -248,6 +256,7 @@ def held_out_likeness(
     Raises:
       InputError: a name twice, drives of one vehicle, or a drive with no number.
     """
+    name_cases(drives.names)
     ClusterBootstrap(drives.vehicle)  # refuses one vehicle before hours of driving
     names = [row.name for row in rows]
     if len(set(names)) < len(names):
@@ -285,6 +294,10 @@ def _driven(row: Row, drives: HeldOut, plan_every: int = 1) -> Driven:
     record: Record = jax.tree.map(lambda x: np.asarray(x)[:count, :STEPS], logs[0])
     assert drives.cases.replay is not None
     human = np.asarray(drives.cases.replay.ego_s, np.float64)[:, 1:]
+    lost = 0
+    if row.program is not None:
+        lost = int(np.sum(~np.isfinite(record.s).all(axis=1)))
+        record = jax.tree.map(np.nan_to_num, record)
     steps = np.asarray(drives.cases.steps)
     lasts = np.arange(STEPS)[None] < steps[:, None]  # [D, S], crash or not
     apart = np.abs(np.asarray(record.s, np.float64) - human)
@@ -312,4 +325,5 @@ def _driven(row: Row, drives: HeldOut, plan_every: int = 1) -> Driven:
             "headway": np.asarray(record.headway)[lasts],
             "time_to_collision": np.asarray(record.ttc)[lasts],
         },
+        not_driven=lost,
     )

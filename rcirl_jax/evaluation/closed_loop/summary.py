@@ -29,7 +29,12 @@ from rcirl_jax.evaluation.statistics import (
     mcnemar_exact,
 )
 from rcirl_jax.runtime.atomic_files import write_whole
-from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
+from rcirl_jax.simulation.metrics import (
+    COLUMNS,
+    CaseMetrics,
+    not_driven,
+    nuplan_score,
+)
 
 # %, the paper's Table II in the order of COLUMNS
 PAPER = {
@@ -120,6 +125,7 @@ class RowSummary:
     parts: Mapping[str, float]  # nuPlan's parts, means
     physical: Mapping[str, float]  # further means and worst values
     families: Mapping[str, Mapping[str, float]]
+    not_driven: int = 0  # cases in which a program gave no plan
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -204,7 +210,8 @@ def _row(
     if scores.size > 1:
         found = combine_seeds(scores, cluster)
         low, high = found.low, found.high
-    fault, cases, samples = np.asarray(m.at_fault) > 0, len(names), int(m.samples.sum())
+    fault, cases = np.asarray(m.at_fault) > 0, len(names)
+    samples = max(int(m.samples.sum()), 1)
     jerks = COLUMNS[4:]
     return RowSummary(
         per_case=_rates(m.holds, cases, COLUMNS),
@@ -232,6 +239,7 @@ def _row(
             name: _family(m, scores, names == name, fault, runs)
             for name in dict.fromkeys(names.tolist())
         },
+        not_driven=int(not_driven(m).sum()),
     )
 
 
@@ -354,6 +362,12 @@ def format_suite(report: SuiteReport) -> str:
          "stop", "off road", "creep", "start", "turns/s", "progress", "nuPlan [95 %]"],
         [_safety(name, row) for name, row in report.rows.items()],
     )  # fmt: skip
+    for name, row in report.rows.items():
+        if row.not_driven:
+            lines.append(
+                f"{name}: {row.not_driven:,} of {report.cases:,} cases not driven: "
+                "they hold no bound, and make no progress"
+            )
     lines += ["", *_differences(report)]
     return "\n".join(lines) + "\n"
 

@@ -70,7 +70,12 @@ from rcirl_jax.evaluation.statistics import (
 )
 from rcirl_jax.runtime.atomic_files import plain, write_json
 from rcirl_jax.simulation.families import family_title
-from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
+from rcirl_jax.simulation.metrics import (
+    COLUMNS,
+    CaseMetrics,
+    not_driven,
+    nuplan_score,
+)
 from rcirl_jax.simulation.rollout import LANES
 from rcirl_jax.simulation.rows import Row
 from rcirl_jax.simulation.suite import drive_row, rollout_config
@@ -99,6 +104,8 @@ def repeats(row: Row, result: SuiteResult, config: SuiteConfig) -> None:
     rollout = rollout_config(row, cases.duration_s, config.plan_every)
     again = drive_row(row, cases.build, count, rollout, chunk=LANES)
     before = jax.tree.map(lambda x: x[:count], result.rows[row.name])
+    both = ~(not_driven(again) | not_driven(before))
+    again, before = jax.tree.map(lambda x: x[both], (again, before))
     if result_hash(again) != result_hash(before):
         raise InputError(
             f"gate: {row.name}: the first {count} cases, driven twice, differ:"
@@ -126,6 +133,7 @@ def judge(pair: Pair, config: GateConfig, part: str = "") -> Verdict:
     part = "; ".join(filter(None, (part, drives)))
     faults = new_faults(pair, config.accept)
     checks = (
+        *_not_driven(pair),
         *_no_more("safety", pair, pair.incumbent, config),
         *_no_loss(pair, config),
         *_families(pair, config),
@@ -301,6 +309,16 @@ def _unmeasured(kind: Kind, name: str, title: str, note: str) -> Check:
     anything = Difference(mean=0.0, low=-1.0, high=1.0, se=np.nan, p=1.0)
     check = _check(kind, name, title, anything, False, False, note=note)
     return dataclasses.replace(check, measured=False)
+
+
+def _not_driven(pair: Pair) -> Iterator[Check]:
+    """Makes an open check of each row that has not driven all cases."""
+    rows = {"candidate": pair.candidate, name_of(pair): pair.incumbent}
+    for name, metrics in rows.items():
+        if lost := int(not_driven(metrics).sum()):
+            note = f"{name} did not drive {lost:,} of {len(pair.runs.ids):,} cases"
+            title = f"all cases driven by {name}"
+            yield _unmeasured("safety", f"driven, {name}", title, note)
 
 
 def _discordant(mine: np.ndarray, theirs: np.ndarray) -> tuple[int, int]:

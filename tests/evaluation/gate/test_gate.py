@@ -37,6 +37,7 @@ def drives(seed=0, jerky=0.4, hard=0.15, way=1000.0):
     holds[:, J] = rng.uniform(size=CASES) >= jerky
     holds[:, A] = rng.uniform(size=CASES) >= hard
     good = ("no_fault", "drivable", "direction", "ttc_bound", "speed_compliance")
+    good = (*good, "samples")
     values |= dict.fromkeys(good, np.ones(CASES))
     values |= {"holds": holds, "comfort": holds[:, J].astype(float)}
     progress = way * rng.uniform(0.8, 1.2, size=CASES)
