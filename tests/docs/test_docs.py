@@ -254,9 +254,16 @@ def test_the_site_is_searched_from_the_disk(site):
         browser.close()
 
 
-@pytest.mark.parametrize("name", ["own_planner.py", "own_planner.cpp"])
-def test_the_page_shows_the_programs_as_they_are(name):
+@pytest.mark.parametrize(
+    ("name", "shown_by"),
+    [
+        ("own_planner.py", "own_planner.md"),
+        ("own_planner.cpp", "own_planner.md"),
+        ("planner_program.py", "own_process.md"),
+    ],
+)
+def test_the_page_shows_the_programs_as_they_are(name, shown_by):
     """A code host shows the page without the site's snippets."""
-    page, file = (DOCS / "own_planner.md").read_text(), REPO / "onboard/example" / name
+    page, file = (DOCS / shown_by).read_text(), REPO / "onboard/example" / name
     assert f'title="onboard/example/{name}"\n{file.read_text()}```' in page
     assert "--8<--" not in page

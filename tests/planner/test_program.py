@@ -168,8 +168,8 @@ def test_what_is_no_plan_is_one_line(kind, line, tmp_path):
         ("", "planner: '': expected a command"),
         ("a 'b", "No closing quotation"),
         ("true", r'true: on start: its process ended with status 0: expected \{"prot'),
-        ("echo hello", r"echo hello: on start: 'hello': expected"),
-        ("echo {}", r"echo \{\}: on start: protocol: missing"),
+        ("sh -c 'read x; echo hello'", "on start: 'hello': expected"),
+        ("sh -c 'read x; echo {}'", "on start: protocol: missing"),
         (
             python(FAULTY, "another protocol"),
             r"protocol: 2: expected \{\"protocol\": 1",
