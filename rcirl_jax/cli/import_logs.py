@@ -141,6 +141,8 @@ def suggest(table: Path) -> None:
         f"\nwritten: {target}; read it through, then\n"
         f"  rcirl import --format=csv --source={source} --input={logs} --output=DATASET"
     )
+    if found.last:
+        print(found.last)
 
 
 def _floors(dataset: Dataset) -> list[dict]:

@@ -7,7 +7,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from rcirl_jax.data.formats.csv.suggest import fields_by_name, suggested, unit_of
+from rcirl_jax.data.formats.csv.names import fields_by_name, unit_of
+from rcirl_jax.data.formats.csv.suggest import suggested
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml
 from tests.data.formats import people
@@ -244,3 +245,76 @@ def test_milliseconds_are_no_times_of_day(tmp_path, first):
     assert toml["units"]["t"] == "ms"
     assert not any("HHMMSS" in line for line in found.lines)
     people.assert_same(made)
+
+
+# nothing that anyone knows: time, id, x, y, heading, speed, length, kind, width
+STRANGE = ("qa", "qb", "qc", "qd", "qe", "qf", "qg", "qh", "qi")
+
+
+def strange(folder, *, units=True, header=STRANGE, drop=()):
+    """A table of a curve whose names say nothing, with or without a line of units."""
+    table = []
+    for k in range(150):
+        for car in range(5):
+            at, v = 0.1 * k, 14.0 + car + np.sin(0.3 * k / 10 + car)
+            way = (14.0 + car) * at - (np.cos(0.3 * at + car) - np.cos(car)) / 0.3
+            h = 0.4 + way / 300.0
+            x, y = 300.0 * np.sin(h), -300.0 * np.cos(h)
+            table.append([at, 7 + 3 * car, x, y, 90.0 - np.rad2deg(h), 3.6 * v])
+            table[-1] += [
+                4.4 + 0.1 * car,
+                "truck" if car == 4 else "car",
+                1.7 + 0.05 * car,
+            ]
+    rows = [
+        *([["s", "-", "m", "m", "°", "km/h", "m", "-", "m"]] if units else []),
+        *table,
+    ]
+    kept = [n for n, name in enumerate(STRANGE) if name not in drop]
+    rows = [[row[n] for n in kept] for row in rows]
+    return people.write(folder, rows, [header[n] for n in kept], between=";")
+
+
+FIELDS = ("t", "id", "x", "y", "heading", "speed", "length", "kind", "width")
+
+
+@pytest.mark.parametrize("is_stated", [True, False])
+def test_by_content_where_names_say_nothing(tmp_path, is_stated):
+    found, toml, (made,) = taken(strange(tmp_path, units=is_stated))
+    assert toml["columns"] == dict(zip(FIELDS, STRANGE, strict=True))
+    assert (toml["units"]["speed"], toml["units"]["heading"]) == ("km/h", "deg")
+    assert toml["heading_convention"] == "cw_from_north"
+    assert sorted(track.id for track in made.tracks) == ["10", "13", "16", "19", "7"]
+    assert 't = "qa"  # guessed: rises in steps of 0.1 within one qb' in found.toml
+    assert 'id = "qb"  # guessed: 5 values, each once at one qa' in found.toml
+    assert found.toml.count("# guessed: the motion fits qf") == 2
+    assert found.toml.count("which of the two is x is a guess") == 2
+    assert "(guessed: the same within one qb, 4.6 m in the median)" in str(found.lines)
+    assert not found.last
+
+
+@pytest.mark.parametrize("field", range(9))
+def test_one_unknown_name_among_known_ones(tmp_path, field):
+    names = ["time", "id", "x", "y", "heading", "speed", "length", "type", "width"]
+    names[field] = "qq"
+    found, toml, _ = taken(strange(tmp_path, header=names))
+    assert toml["columns"] == dict(zip(FIELDS, names, strict=True))
+    assert found.toml.count("guessed: ") == 1
+
+
+def test_what_nothing_tells_is_left_open(tmp_path):
+    """Without a clock: the draft names the columns, and an import refuses it."""
+    path = strange(tmp_path, drop=("qa",), header=[*STRANGE[:1], "id", *STRANGE[2:]])
+    source = tmp_path / "draft.toml"
+    done = command("rcirl_jax", "import", f"--suggest={path}", f"--output={source}")
+    assert done.returncode == 0, done.stderr
+    columns = load_toml(source)["columns"]
+    assert (columns["t"], columns["id"]) == ("?", "id")
+    assert 't = "?"  # one of: qc, ' in source.read_text()
+    assert "not known: t: one of: qc, " in done.stdout
+    last = done.stdout.splitlines()[-1]
+    assert last.startswith('fill in the lines with "?" before you import; words ')
+    with pytest.raises(
+        InputError, match=r"columns\.t: \?: expected the name of a colu"
+    ):
+        people.read(path, source)

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.formats.csv.names import words_of
 from rcirl_jax.data.formats.options import UNITS, number, one_of, positive, section
 from rcirl_jax.data.formats.projection import projected
 from rcirl_jax.data.readers.tables.cells import (
@@ -83,7 +84,7 @@ DATE_DIGITS = re.compile(
 CLOCK_FROM = 1e6  # HHMMSSmmm from 00:10 on; numbers below it are common counters
 HOLE_S = 40.0  # s that digits leave out at the end of a minute, 4040 of an hour
 AT_A_MINUTE_S = 2.0  # s at most between the last row of a minute and the next one
-WORD = r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+"  # of a name in camel case too
+UNCLEAR = "?"  # in a draft: a needed column that nobody knows
 HOLE = "{id}"  # in a column's name: which road user's it is
 # name -> sign and zero [rad]; north is +y
 CONVENTIONS = {
@@ -194,6 +195,11 @@ def _named(
     for field, column in columns.items():
         if not isinstance(column, str) or not column:
             raise InputError(f"{where}{field}: {column}: expected a name")
+    if still := [field for field, column in columns.items() if column == UNCLEAR]:
+        raise InputError(
+            f"{where}{still[0]}: {UNCLEAR}: expected the name of a column; fill in the "
+            f"lines of the draft: {', '.join(still)}"
+        )
     for name, field in EARTH.items():
         if name in columns:
             if field in columns:
@@ -229,11 +235,6 @@ def _named(
                 note = f"columns {columns[x]}, {columns[y]}: longitude and latitude"
                 return {**columns, **own}, {**units, "x": "deg", "y": "deg"}, [note]
     return columns, units, []
-
-
-def words_of(name: str) -> set[str]:
-    """Returns words of a column's name: gpsLon and GPS_Lon hold lon."""
-    return {word.lower() for word in re.findall(WORD, name)}
 
 
 def known_cells(table: Table, column: str) -> list[str]:

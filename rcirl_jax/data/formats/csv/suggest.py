@@ -1,11 +1,12 @@
 """A source TOML for a table of which nothing is said, and its first rows as understood.
 
-Names of columns, units in them and the numbers of the first rows tell what can be told.
-The TOML is read back like any other: what is shown is what an import would take.
+Names of columns, units in them and the numbers of the first rows tell what can be told;
+a column known by its content alone is marked as guessed. A needed column that nothing
+tells is written as `?`, with the columns that it may be. Without one the TOML is read
+back like any other: what is shown is what an import would take.
 """
 
 import dataclasses
-import functools
 import json
 import math
 import re
@@ -23,7 +24,7 @@ from rcirl_jax.data.formats.csv.columns import (
     NO,
     OPTIONAL,
     RATE_HZ,
-    WORD,
+    UNCLEAR,
     YES,
     LogColumns,
     Meaning,
@@ -36,8 +37,9 @@ from rcirl_jax.data.formats.csv.columns import (
     meaning_of,
     sampled,
     with_velocity,
-    words_of,
 )
+from rcirl_jax.data.formats.csv.content import fields_by_content, unclear
+from rcirl_jax.data.formats.csv.names import fields_by_name, kind_by_name, unit_of
 from rcirl_jax.data.formats.csv.reader import PATTERNS, Log, opened
 from rcirl_jax.data.formats.files import table_stem
 from rcirl_jax.data.formats.options import KINDS, UNITS
@@ -52,7 +54,6 @@ from rcirl_jax.data.readers.tables.table import (
 )
 from rcirl_jax.data.readers.tables.text import NUMBER
 from rcirl_jax.errors import InputError, as_input_error
-from rcirl_jax.runtime.specs import load_toml, spec_root
 
 USUAL_RATES = (1, 2, 4, 5, 10, 12.5, 15, 20, 24, 25, 29.97, 30, 50, 60, 100, 120)
 RATE_FITS = 0.1  # relative
@@ -62,7 +63,6 @@ NO_RATE = "rate_hz: rows per second of one road user; 10 is assumed"
 LONG_CAR_M = 9.0  # m; a longer median vehicle was measured in feet
 # recorded speed over that of the positions, both in m/s if it were m/s
 SPEED_RATIOS = {"m/s": 1.0, "km/h": 3.6, "ft/s": 3.2808, "mph": 2.2369, "kn": 1.9438}
-PIXELS = {"px", "pix", "pixel", "pixels"}  # words of a name, of no use as metres
 ROWS_SHOWN = 5
 # field -> its unit where rows are shown, "": none
 SHOWN = {
@@ -74,6 +74,11 @@ INSTEAD = {
     **{"length": "4.5 m for all", "width": "1.8 m for all"},
     **{"kind": "all are vehicles", "lane": "lanes along the paths driven"},
 }  # field -> what is taken where no column says it
+NAMES_SHOWN = 20  # of columns that a field may be
+FILL_IN = (
+    f'fill in the lines with "{UNCLEAR}" before you import; words by which columns are '
+    "known may be added to data_specs/column_names.toml"
+)
 NEVER_KNOWN = (
     "speed_limit: 29.06 m/s (65 mph) until you say better",
     "reference_point: the centre of the box is assumed",
@@ -88,6 +93,7 @@ class Suggestion:
 
     toml: str
     lines: tuple[str, ...]  # for the terminal
+    last: str = ""  # likewise, below the others
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -101,6 +107,13 @@ class _Guess:
     kinds: dict[str, str] = dataclasses.field(default_factory=dict)
     rate_hz: float | None = None
     open: list[str] = dataclasses.field(default_factory=list)  # what is not known
+    # field -> comment of its line: by what it was guessed, or what it may be
+    comments: dict[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def unclear(self) -> list[str]:
+        """Returns the needed fields of which nobody knows the column."""
+        return [field for field, name in self.columns.items() if name == UNCLEAR]
 
     def spec(self) -> dict:
         """As the TOML's content."""
@@ -114,11 +127,16 @@ def suggested(path: Path) -> Suggestion:
     """Returns a source TOML by the head of a table.
 
     Raises:
-      InputError: no table, or one without columns that look like time, id and places.
+      InputError: no table, or one whose first rows nobody can read.
     """
     with as_input_error(str(path), "a table with a row per road user and time"):
         table = open_table(path)
         guess = _guess_columns(table)
+        if guess.unclear:
+            _guess_stated_units(table, guess)
+            lines = tuple(_in_words(table, guess, ()))
+            draft = _toml_of(path, guess, Meaning())
+            return Suggestion(toml=draft, lines=lines, last=FILL_IN)
         _guess_time_form(table, guess)
         _, raw = _first_rows(path, guess.spec())
         _guess_clock(table, raw, guess)
@@ -153,13 +171,18 @@ def _guess_columns(table: Table) -> _Guess:
         said.append(f"a row per frame: {wide['x']}, {wide['y']} for each road user")
     needed = ("t", "id", *(("lat", "lon") if "lat" in found else ("x", "y")))
     is_wide = HOLE in found.get("x", "")
-    missing = [f for f in needed if f not in found and not (is_wide and f == "id")]
-    if missing:
-        raise InputError(
-            f"{table.path}: no column looks like {', '.join(missing)}: expected them "
-            f"among {[n for n in table.header if n][:40]}; write the TOML by hand"
-        )
-    return _Guess(columns=found, said=said)
+    guess = _Guess(columns=found, said=said)
+    for field, one in ({} if is_wide else fields_by_content(table, found)).items():
+        guess.columns[field] = one.column
+        guess.comments[field] = f"guessed: {one.why}"
+    for field in needed:
+        if field not in guess.columns and not (is_wide and field == "id"):
+            names = unclear(table, field, [*guess.columns.values()])[:NAMES_SHOWN]
+            guess.columns[field] = UNCLEAR
+            guess.comments[field] = f"one of: {', '.join(names)}"
+    order = [*needed, *guess.columns]
+    columns = {f: guess.columns[f] for f in order if f in guess.columns}
+    return dataclasses.replace(guess, columns=columns)
 
 
 def _first_rows(path: Path, spec: Mapping) -> tuple[Log, Rows]:
@@ -211,6 +234,13 @@ def _guess_clock_digits(table: Table, guess: _Guess) -> None:
             _said_unit(table, "t", guess, ("ms", "us", "ns", "s")) or "ms"
         )
         guess.open.append(f"units.t: {guess.units['t']}, or {form} of times of day?")
+
+
+def _guess_stated_units(table: Table, guess: _Guess) -> None:
+    """Units that names say, or the line below the header."""
+    for field in guess.columns.keys() & ALLOWED_UNITS.keys() - {*guess.unclear}:
+        if unit := _said_unit(table, field, guess):
+            guess.units[field] = unit
 
 
 def _usual_rate(rate: float, fits: float) -> float | None:
@@ -361,7 +391,9 @@ def _in_words(table: Table, guess: _Guess, notes: Sequence[str]) -> list[str]:
     found = ["Parquet or Feather" if layout is None else layout.in_words()]
     for field, column in columns.items():
         unit = f", {guess.units[field]}" if field in guess.units else ""
-        found.append(f"{field}: column {column}{unit}")
+        why = f" ({guess.comments[field]})" if field in guess.comments else ""
+        if column != UNCLEAR:
+            found.append(f"{field}: column {column}{unit}{why}")
     known = {*columns}
     known |= {"heading", "speed"} if {"vx", "vy"} <= known else set()
     missing = [f"{f}: no column; {i}" for f, i in INSTEAD.items() if f not in known]
@@ -371,6 +403,7 @@ def _in_words(table: Table, guess: _Guess, notes: Sequence[str]) -> list[str]:
     unused = [name for name in table.header if name and not re.fullmatch(used, name)]
     return [
         *(f"recognised: {line}" for line in (*found, *guess.said, *notes)),
+        *(f"not known: {f}: {guess.comments[f]}" for f in guess.unclear),
         *(f"not known: {line}" for line in (*guess.open, *missing, *NEVER_KNOWN)),
         *([f"not used: {', '.join(unused)}"] if unused else []),
     ]
@@ -425,11 +458,20 @@ kind = "vehicle"
 def _toml_of(path: Path, guess: _Guess, meaning: Meaning) -> str:
     """The text of the source TOML, whose texts JSON writes alike."""
 
+    def comment(words: str) -> str:
+        plain = "".join(c if c.isprintable() else " " for c in words)
+        return f"  # {plain}" if plain else ""
+
     def text(value: str) -> str:
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
     def lines(values: Mapping[str, str]) -> str:
         return "\n".join(f"{name} = {text(value)}" for name, value in values.items())
+
+    columns = [
+        f"{f} = {text(column)}{comment(guess.comments.get(f, ''))}"
+        for f, column in guess.columns.items()
+    ]
 
     form = meaning.form  # of headings; said where it is not as usual
     own = path.name.removeprefix(table_stem(path))
@@ -441,98 +483,9 @@ def _toml_of(path: Path, guess: _Guess, meaning: Meaning) -> str:
         source=text(table_stem(path)),
         pattern=text(f"*{ending}"),
         convention=f'{CONVENTION} = "{form.name}"\n' if form and form.note else "",
-        columns=lines(guess.columns),
+        columns="\n".join(columns),
         units=lines(guess.units),
         scale=f"\n[scale]\n{scale}\n" if scale else "",
         rate=guess.rate_hz or 10.0,
         kinds=f"\n[kinds]\n{kinds}\n" if kinds else "",
     )
-
-
-@functools.cache
-def _words() -> dict:
-    """Returns the names of columns, of data_specs/column_names.toml."""
-    return load_toml(spec_root() / "column_names.toml")
-
-
-def plain_words(name: str) -> list[str]:
-    """Returns words of a column's name without those of a unit; owners stand apart."""
-    bare = re.sub(r"[\[(].*?[\])]", " ", with_unit_apart(name))
-    units = {
-        text for texts in _words()["units"].values() for text in texts if len(text) > 1
-    }
-    words, owners = [], _words()["owners"]
-    for word in (found.lower() for found in re.findall(rf"{WORD}|\d+", bare)):
-        glued = (o for o in owners if word.startswith(o) and len(word) > len(o) + 1)
-        owner = next(glued, "")  # plurals stay whole
-        words += [owner, word.removeprefix(owner)] if owner else [word]
-    return [w for w in words if w not in units and w not in ("kf", "smoothed", "raw")]
-
-
-def with_unit_apart(name: str) -> str:
-    """Returns "headX [ft]" of "headXft": a unit that is glued to a coordinate."""
-    return re.sub(r"([XY])(ft|m|cm|px|pix|pixels?)$", r"\1 [\2]", name)
-
-
-def is_no_place(name: str, header: Sequence[str]) -> bool:
-    """True for a coordinate in pixels, or of another point than the middle.
-
-    A column without a unit is one of pixels where another is called alike, with a unit.
-    """
-    said = with_unit_apart(name)
-    if re.search(r"\[(px|pix|pixels?)\]$", said) or set(plain_words(name)) & PIXELS:
-        return True
-    if not set(_words()["not_middle"]).isdisjoint(plain_words(name)):
-        return True
-    twins = (with_unit_apart(other) for other in header if other != name)
-    return said == name and any(twin.startswith(f"{name} [") for twin in twins)
-
-
-def unit_of(name: str, allowed: Sequence[str]) -> str:
-    """Returns the unit that a column's name says, "" without one."""
-    name = with_unit_apart(name)
-    said = re.findall(r"[\[(]\s*(.+?)\s*[\])]", name)
-    said += [name.rsplit("_", 1)[-1]] if "_" in name else []
-    for text in said:
-        for unit in allowed:
-            if text.lower() in _words()["units"].get(unit, ()):
-                return unit
-    return ""
-
-
-def fields_by_name(header: Sequence[str]) -> dict[str, str]:
-    """Returns field -> column, as far as names tell; each column once."""
-    words = {name: plain_words(name) for name in header if name}
-    met = [word for own in words.values() for word in set(own)]
-    common = {w for w in met if len(words) > 3 and met.count(w) > len(words) / 2}
-    found: dict[str, str] = {}
-    every_word = _words()
-    for field, known in every_word["fields"].items():
-        scores = {}  # how badly a name fits: words too many, and how unlikely it is
-        for name, every in words.items():
-            own = [word for word in every if word not in common] or every
-            hits = [known.index(word) for word in own if word in known]
-            is_other = not set(every_word["other"]).isdisjoint(own) or (
-                field in ("x", "y", "lat", "lon")
-                and not set(every_word["motion"]).isdisjoint(own)
-            )
-            if name in found.values():
-                continue
-            last = field in ("x", "y") and is_no_place(name, header)
-            if (joined := "".join(own)) in known:
-                scores[name] = last, 0, known.index(joined)
-            elif hits and not is_other:
-                scores[name] = last, len(set(own)) - 1, min(hits)
-        if scores:
-            found[field] = min(scores, key=lambda name: scores[name])
-    others = ("x", "y") if {"lat", "lon"} <= found.keys() else ("lat", "lon")
-    return {field: name for field, name in found.items() if field not in others}
-
-
-def kind_by_name(text: str) -> str:
-    """Returns the kind of a road user by a word of a name; "" unknown."""
-    words = words_of(text) | {text.lower()}
-    for kind in ("cyclist", "pedestrian", "static", "vehicle"):
-        if any(word in _words()["kinds"][kind] for word in words):
-            return kind
-    return ""

@@ -1,0 +1,103 @@
+"""The meaning of names of columns, by data_specs/column_names.toml."""
+
+import functools
+import re
+from collections.abc import Sequence
+
+from rcirl_jax.runtime.specs import load_toml, spec_root
+
+WORD = r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+"  # of a name in camel case too
+PIXELS = {"px", "pix", "pixel", "pixels"}  # words of a name, of no use as metres
+
+
+def words_of(name: str) -> set[str]:
+    """Returns words of a column's name: gpsLon and GPS_Lon hold lon."""
+    return {word.lower() for word in re.findall(WORD, name)}
+
+
+@functools.cache
+def every_word() -> dict:
+    """Returns the names of columns, of data_specs/column_names.toml."""
+    return load_toml(spec_root() / "column_names.toml")
+
+
+def plain_words(name: str) -> list[str]:
+    """Returns words of a column's name without those of a unit; owners stand apart."""
+    bare = re.sub(r"[\[(].*?[\])]", " ", with_unit_apart(name))
+    every = every_word()
+    written = [text for texts in every["units"].values() for text in texts]
+    units = {text for text in written if len(text) > 1}
+    words, owners = [], every["owners"]
+    for word in (found.lower() for found in re.findall(rf"{WORD}|\d+", bare)):
+        glued = (o for o in owners if word.startswith(o) and len(word) > len(o) + 1)
+        owner = next(glued, "")  # plurals stay whole
+        words += [owner, word.removeprefix(owner)] if owner else [word]
+    return [w for w in words if w not in units and w not in ("kf", "smoothed", "raw")]
+
+
+def with_unit_apart(name: str) -> str:
+    """Returns "headX [ft]" of "headXft": a unit that is glued to a coordinate."""
+    return re.sub(r"([XY])(ft|m|cm|px|pix|pixels?)$", r"\1 [\2]", name)
+
+
+def is_no_place(name: str, header: Sequence[str]) -> bool:
+    """True for a coordinate in pixels, or of another point than the middle.
+
+    A column without a unit is one of pixels where another is called alike, with a unit.
+    """
+    said = with_unit_apart(name)
+    if re.search(r"\[(px|pix|pixels?)\]$", said) or set(plain_words(name)) & PIXELS:
+        return True
+    if not set(every_word()["not_middle"]).isdisjoint(plain_words(name)):
+        return True
+    twins = (with_unit_apart(other) for other in header if other != name)
+    return said == name and any(twin.startswith(f"{name} [") for twin in twins)
+
+
+def unit_of(name: str, allowed: Sequence[str]) -> str:
+    """Returns the unit that a column's name says, "" without one."""
+    name = with_unit_apart(name)
+    said = re.findall(r"[\[(]\s*(.+?)\s*[\])]", name)
+    said += [name.rsplit("_", 1)[-1]] if "_" in name else []
+    for text in said:
+        for unit in allowed:
+            if text.lower() in every_word()["units"].get(unit, ()):
+                return unit
+    return ""
+
+
+def fields_by_name(header: Sequence[str]) -> dict[str, str]:
+    """Returns field -> column, as far as names tell; each column once."""
+    words = {name: plain_words(name) for name in header if name}
+    met = [word for own in words.values() for word in set(own)]
+    common = {w for w in met if len(words) > 3 and met.count(w) > len(words) / 2}
+    found: dict[str, str] = {}
+    for field, known in every_word()["fields"].items():
+        scores = {}  # how badly a name fits: words too many, and how unlikely it is
+        for name, every in words.items():
+            own = [word for word in every if word not in common] or every
+            hits = [known.index(word) for word in own if word in known]
+            is_other = not set(every_word()["other"]).isdisjoint(own) or (
+                field in ("x", "y", "lat", "lon")
+                and not set(every_word()["motion"]).isdisjoint(own)
+            )
+            if name in found.values():
+                continue
+            last = field in ("x", "y") and is_no_place(name, header)
+            if (joined := "".join(own)) in known:
+                scores[name] = last, 0, known.index(joined)
+            elif hits and not is_other:
+                scores[name] = last, len(set(own)) - 1, min(hits)
+        if scores:
+            found[field] = min(scores, key=lambda name: scores[name])
+    others = ("x", "y") if {"lat", "lon"} <= found.keys() else ("lat", "lon")
+    return {field: name for field, name in found.items() if field not in others}
+
+
+def kind_by_name(text: str) -> str:
+    """Returns the kind of a road user by a word of a name; "" unknown."""
+    words = words_of(text) | {text.lower()}
+    for kind in ("cyclist", "pedestrian", "static", "vehicle"):
+        if any(word in every_word()["kinds"][kind] for word in words):
+            return kind
+    return ""
