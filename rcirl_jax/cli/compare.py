@@ -5,7 +5,8 @@
 
 RUN is a folder of `rcirl autotune`, finished up to its verdict. The page says what each
 was decided, which settings and data differ, and how its numbers compare, with their
-intervals. Nothing in the runs is changed. Needs the extra [report].
+intervals. Nothing in the runs is changed; one with a file that was edited since is
+refused. Needs the extra [report].
 """
 
 from pathlib import Path

@@ -17,6 +17,7 @@ from rcirl_jax.runtime.checked import checked, leaves
 from rcirl_jax.runtime.pipeline import Stages
 
 RUN = "a folder of `rcirl autotune`, finished up to its verdict"
+READ = ("verdict.json", "suite/suite.json", "likeness.json", "ranking.json")
 HEX = 12  # digits of a hash that are shown
 # flags that say where a run was made, not what it is
 PLACES = ("output", "run", "executor", "workers", "ray_address", "trackers")
@@ -120,12 +121,14 @@ def read_run(folder: Path) -> ComparedRun:
     """Read the run in a folder.
 
     Raises:
-      InputError: it is no run, or has no verdict yet.
+      InputError: it is no run, has no verdict yet, or a file was changed since.
     """
-    stages = Stages(folder=folder).read()
-    path = folder / "verdict.json"
+    kept = Stages(folder=folder)
+    stages, path = kept.read(), folder / "verdict.json"
     if "gate" not in stages or not path.is_file():
         raise InputError(f"{folder}: no verdict in it: expected {RUN}")
+    for name in READ:
+        kept.check_kept(folder / name)
     verdict = checked(read_json(path, "a verdict"), _VerdictFile, path)
     settings = _settings(stages, verdict)
     return ComparedRun(

@@ -177,6 +177,21 @@ class Stages:
             for path, name in zip(outputs, names, strict=True)
         )
 
+    def check_kept(self, path: Path) -> None:
+        """Checks that a file of the run, or its absence, is as a stage left it.
+
+        Raises:
+          InputError: another sha256 than the record's, or no record of it.
+        """
+        name = path.relative_to(self.folder).as_posix()
+        records = [x["outputs"] for x in self.read().values()]
+        made = [x[name] for x in records if name in x] or [None]
+        if (file_sha256(path) if path.is_file() else None) not in made:
+            raise InputError(
+                f"{path}: changed since the run wrote it: expected the sha256 that "
+                f"{FILE} has of it"
+            )
+
     def read(self) -> dict[str, Any]:
         """Reads the finished stages by name.
 

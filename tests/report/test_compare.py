@@ -5,9 +5,12 @@ import re
 
 import pytest
 
+from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.gate.types import GateConfig
 from rcirl_jax.evaluation.gate.verdict import write_verdict
 from rcirl_jax.evaluation.statistics import clopper_pearson
+from rcirl_jax.report.compare import read_run
+from rcirl_jax.runtime.pipeline import file_sha256
 from tests.helpers.commands import refused, succeeded
 from tests.report.test_data_page import Page
 from tests.report.tuning_case import suite_and_verdict
@@ -15,7 +18,9 @@ from tests.report.tuning_case import suite_and_verdict
 RATE = {"k": 80, "n": 120, "rate": 0.667, "low": 0.574, "high": 0.75, "bound": None}
 
 
-def write_run(folder, *, recipe="tuned", rate=0.01, data="ab" * 32, nuplan=0.9):
+def write_run(
+    folder, *, recipe="tuned", rate=0.01, data="ab" * 32, nuplan=0.9, drives=True
+):
     """A run folder with the files that a comparison reads, made up."""
     _, verdict = suite_and_verdict()
     (folder / "suite").mkdir(parents=True)
@@ -35,15 +40,19 @@ def write_run(folder, *, recipe="tuned", rate=0.01, data="ab" * 32, nuplan=0.9):
         },
     }  # fmt: skip
     top1 = {"value": 2.5, "low": 2.3, "high": 2.7}
-    for name, body in {
-        "stages.json": {"schema_version": 1, "stages": stages},
+    distance = {"distance_m": {"mean": 1.6, "low": 1.2, "high": 2}}
+    for name, rows_of in {
         "suite/suite.json": {"report": {"rows": {"candidate": row}}},
-        "likeness.json": {
-            "rows": {"candidate": {"distance_m": {"mean": 1.6, "low": 1.2, "high": 2}}}
-        },
+        "likeness.json": {"rows": {"candidate": distance}},
         "ranking.json": {"rows": {"candidate": {"top1_fde": top1}}},
     }.items():
-        (folder / name).write_text(json.dumps(body))
+        if drives or name != "likeness.json":
+            (folder / name).write_text(json.dumps(rows_of))
+    made = [x for x in folder.rglob("*.json")]
+    names = {x.relative_to(folder).as_posix(): file_sha256(x) for x in made}
+    stages["gate"]["outputs"] = names
+    body = {"schema_version": 1, "stages": stages}
+    (folder / "stages.json").write_text(json.dumps(body))
     return folder, verdict
 
 
@@ -53,9 +62,9 @@ def compared(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     first, verdict = write_run(folder / "first")
     second, _ = write_run(
-        folder / "second", recipe="paper", rate=0.02, data="cd" * 32, nuplan=0.8
-    )
-    (second / "likeness.json").unlink()
+        folder / "second", recipe="paper", rate=0.02, data="cd" * 32, nuplan=0.8,
+        drives=False,
+    )  # fmt: skip
     page = folder / "compare.html"
     succeeded("rcirl_jax", "compare", str(first), str(second), f"--output={page}")
     return page, verdict
@@ -91,6 +100,19 @@ def test_numbers_of_the_runs_with_their_intervals(compared):
     assert first[3] == f"10.00 [{low:.2f}, {high:.2f}] %"
     assert first[4:] == ["1.60 [1.20, 2.00] m", "2.50 [2.30, 2.70] m"]
     assert second[4] == "not measured"
+
+
+@pytest.mark.parametrize("name", ["verdict.json", "suite/suite.json", "likeness.json"])
+def test_a_file_that_was_edited_or_removed_is_refused(name, tmp_path):
+    run, verdict = write_run(tmp_path / "run")
+    assert read_run(run).decision == verdict.decision
+    path = run / name
+    path.write_text(path.read_text().replace(verdict.decision, "ship") + " ")
+    with pytest.raises(InputError, match=f"{name}: changed since the run wrote it"):
+        read_run(run)
+    path.unlink()
+    with pytest.raises(InputError, match=r"no verdict|changed since"):
+        read_run(run)
 
 
 @pytest.mark.multiprocess
