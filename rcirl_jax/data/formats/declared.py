@@ -40,7 +40,9 @@ def with_numbers_and_texts(spec: dict, packaged: Mapping) -> dict:
 
 def open_log(path: Path, spec: Mapping) -> tuple[Table, RowStats]:
     """Opens a table as its source TOML says, and counts of its rows."""
-    table = open_table(path, section(spec, "table"))
+    known = [*section(spec, "columns").values(), *section(spec, "kinds")]
+    known = [name for name in known if isinstance(name, str)]
+    table = open_table(path, section(spec, "table"), known)
     return table, RowStats(path=path, unit=table.unit, allowed=allowed_share(spec))
 
 

@@ -318,3 +318,37 @@ def test_what_nothing_tells_is_left_open(tmp_path):
         InputError, match=r"columns\.t: \?: expected the name of a colu"
     ):
         people.read(path, source)
+
+
+# the same header as firms of several countries write it
+FOREIGN = {
+    "cp1250": ("Czas", "Nr pojazdu", "X", "Y", "Azymut", "Prędkość", "Długość",
+               "Rodzaj", "Szerokość"),
+    "cp1252": ("Tiempo", "Vehículo", "X", "Y", "Rumbo", "Velocidad", "Comprimento",
+               "Categoría", "Anchura"),
+    "utf-8": ("Čas", "Vozidlo", "X", "Y", "Směr", "Rychlost", "Délka", "Druh", "Šířka"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("encoding", FOREIGN)
+def test_words_of_names_tell_the_encoding(tmp_path, encoding):
+    path = strange(tmp_path, header=FOREIGN[encoding])
+    path.write_bytes(path.read_text().encode(encoding))
+    found, toml, (made,) = taken(path)
+    assert toml["columns"] == dict(zip(FIELDS, FOREIGN[encoding], strict=True))
+    assert toml.get("table", {}).get("encoding", "utf-8") == encoding
+    assert "a guess" not in found.toml
+    assert len(made.tracks) == 5
+
+
+def test_an_encoding_that_nothing_tells_is_said(tmp_path):
+    path = strange(tmp_path, header=[*STRANGE[:5], "qłą", *STRANGE[6:]])
+    path.write_bytes(path.read_text().encode("cp1250"))
+    found, toml, _ = taken(path)
+    line = (
+        "not known: encoding: read as cp1252, a guess; if names look wrong set [table] "
+        "encoding, for example cp1250"
+    )
+    assert line in found.lines
+    assert toml["table"] == {"encoding": "cp1252"}
+    assert 'encoding = "cp1252"  # a guess: another one, such as cp1250' in found.toml

@@ -97,6 +97,23 @@ ENCODED = {
     )
     for encoding in ("utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "cp1252")
 }
+# names that the source TOML says tell encodings apart
+FOREIGN = {
+    **{
+        "cp1252": "Longueur à",
+        "cp1250": "Długość",
+        "cp1251": "Длина",
+        "cp1253": "Μήκος",
+    },
+    **{"cp1254": "Uzunluğu ş", "shift_jis": "長さ", "gb18030": "长度"},
+}
+ENCODED |= {
+    f"{encoding} by its names": Way(
+        content=text(rows(), (*HEADER[:6], name, "kind"), between=";").encode(encoding),
+        columns={**{c: c for c in HEADER}, "length": name},
+    )
+    for encoding, name in FOREIGN.items()
+}
 NAMES = f"names = {list(HEADER)}".replace("'", '"')
 # what the TOML says wins
 SAID = {

@@ -21,6 +21,13 @@ def every_word() -> dict:
     return load_toml(spec_root() / "column_names.toml")
 
 
+def foreign_words() -> list[str]:
+    """Returns the words of fields and kinds that are not of ASCII alone."""
+    every = every_word()
+    lists = [*every["fields"].values(), *every["kinds"].values()]
+    return [word for words in lists for word in words if not word.isascii()]
+
+
 def plain_words(name: str) -> list[str]:
     """Returns words of a column's name without those of a unit; owners stand apart."""
     bare = re.sub(r"[\[(].*?[\])]", " ", with_unit_apart(name))

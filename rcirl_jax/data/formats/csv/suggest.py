@@ -39,11 +39,17 @@ from rcirl_jax.data.formats.csv.columns import (
     with_velocity,
 )
 from rcirl_jax.data.formats.csv.content import fields_by_content, unclear
-from rcirl_jax.data.formats.csv.names import fields_by_name, kind_by_name, unit_of
+from rcirl_jax.data.formats.csv.names import (
+    fields_by_name,
+    foreign_words,
+    kind_by_name,
+    unit_of,
+)
 from rcirl_jax.data.formats.csv.reader import PATTERNS, Log, opened
 from rcirl_jax.data.formats.files import table_stem
 from rcirl_jax.data.formats.options import KINDS, UNITS
 from rcirl_jax.data.readers.tables.rows import LINE, Rows, RowStats
+from rcirl_jax.data.readers.tables.streams import UNTOLD
 from rcirl_jax.data.readers.tables.table import (
     MAX_TIME,
     Field,
@@ -52,7 +58,7 @@ from rcirl_jax.data.readers.tables.table import (
     batches,
     open_table,
 )
-from rcirl_jax.data.readers.tables.text import NUMBER
+from rcirl_jax.data.readers.tables.text import NUMBER, Layout
 from rcirl_jax.errors import InputError, as_input_error
 
 USUAL_RATES = (1, 2, 4, 5, 10, 12.5, 15, 20, 24, 25, 29.97, 30, 50, 60, 100, 120)
@@ -75,6 +81,10 @@ INSTEAD = {
     **{"kind": "all are vehicles", "lane": "lanes along the paths driven"},
 }  # field -> what is taken where no column says it
 NAMES_SHOWN = 20  # of columns that a field may be
+READ_AS = (
+    "encoding: read as {}, a guess; if names look wrong set [table] encoding, for "
+    "example cp1250"
+)
 FILL_IN = (
     f'fill in the lines with "{UNCLEAR}" before you import; words by which columns are '
     "known may be added to data_specs/column_names.toml"
@@ -102,6 +112,7 @@ class _Guess:
 
     columns: dict[str, str]
     said: list[str]
+    layout: Layout | None  # of the text
     units: dict[str, str] = dataclasses.field(default_factory=dict)
     scale: dict[str, float] = dataclasses.field(default_factory=dict)
     kinds: dict[str, str] = dataclasses.field(default_factory=dict)
@@ -130,7 +141,7 @@ def suggested(path: Path) -> Suggestion:
       InputError: no table, or one whose first rows nobody can read.
     """
     with as_input_error(str(path), "a table with a row per road user and time"):
-        table = open_table(path)
+        table = open_table(path, known=foreign_words())
         guess = _guess_columns(table)
         if guess.unclear:
             _guess_stated_units(table, guess)
@@ -171,7 +182,10 @@ def _guess_columns(table: Table) -> _Guess:
         said.append(f"a row per frame: {wide['x']}, {wide['y']} for each road user")
     needed = ("t", "id", *(("lat", "lon") if "lat" in found else ("x", "y")))
     is_wide = HOLE in found.get("x", "")
-    guess = _Guess(columns=found, said=said)
+    layout = table.layout
+    guess = _Guess(columns=found, said=said, layout=layout)
+    if layout and layout.is_guess:
+        guess.open.append(READ_AS.format(layout.encoding))
     for field, one in ({} if is_wide else fields_by_content(table, found)).items():
         guess.columns[field] = one.column
         guess.comments[field] = f"guessed: {one.why}"
@@ -440,7 +454,7 @@ speed_limit = 29.06                    # m/s, where a lane has none
 lane_width_m = 3.5                     # m
 reference_point = "centre"             # what x, y point at, or front, rear
 max_bad_rows = 0.01                    # share of rows that may be dropped
-{convention}
+{convention}{table}
 [columns]
 {columns}
 
@@ -473,6 +487,11 @@ def _toml_of(path: Path, guess: _Guess, meaning: Meaning) -> str:
         for f, column in guess.columns.items()
     ]
 
+    layout = guess.layout
+    encoding = layout.encoding if layout and layout.encoding in UNTOLD else ""
+    table = f"\n[table]\nencoding = {text(encoding)}" if encoding else ""
+    if layout and layout.is_guess:
+        table += comment("a guess: another one, such as cp1250, if names look wrong")
     form = meaning.form  # of headings; said where it is not as usual
     own = path.name.removeprefix(table_stem(path))
     ending = own if f"*{own}" in PATTERNS else path.name.removeprefix(path.stem)
@@ -483,6 +502,7 @@ def _toml_of(path: Path, guess: _Guess, meaning: Meaning) -> str:
         source=text(table_stem(path)),
         pattern=text(f"*{ending}"),
         convention=f'{CONVENTION} = "{form.name}"\n' if form and form.note else "",
+        table=f"{table}\n" if table else "",
         columns="\n".join(columns),
         units=lines(guess.units),
         scale=f"\n[scale]\n{scale}\n" if scale else "",

@@ -80,7 +80,7 @@ def is_log(file: Path, table: Table | None) -> bool:
     if is_columnar(file) or not _is_drive(file):
         return False
     try:
-        lines = head_of(file)[1]
+        lines = head_of(file)[-1]
     except InputError:
         return False
     names = (name.strip() for line in lines for name in line.split(","))
@@ -102,7 +102,7 @@ def _is_drive(path: Path) -> bool:
 def _first_lines(path: Path) -> tuple[list[list[str]], list[str]]:
     """(cells of the lines above the column names, or of the first ones; the names)."""
     lines: list[list[str]] = []
-    for text in head_of(path)[1][:MAX_HEADER_LINES]:
+    for text in head_of(path)[-1][:MAX_HEADER_LINES]:
         cells = [cell.strip().strip('"') for cell in text.strip().split(",")]
         while cells and not cells[-1]:
             cells.pop()

@@ -1,14 +1,15 @@
 """The text of a file, a few MiB at a time: unpacked, decoded, in whole rows.
 
 What packs a file (gzip, zstd, bzip2) and how its characters are written (UTF-8 with
-and without a mark, UTF-16, else Windows' 1252) is told by its bytes, not its name. No
-more than a block and one line are held.
+and without a mark, UTF-16) is told by its bytes, not its name; where they do not tell,
+by names that it should hold, else it is read as Windows' 1252. No more than a block and
+one line are held.
 """
 
 import codecs
 import contextlib
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -36,6 +37,12 @@ BYTE_ORDERS = {
     codecs.BOM_UTF16_LE: "utf-16",
     codecs.BOM_UTF16_BE: "utf-16",
 }  # first bytes -> encoding, the longer first
+
+
+# encodings that bytes do not tell apart, the likelier first; those of one byte a
+# character, and others
+ONE_BYTE = ("cp1252", "cp1250", "cp1251", "cp1253", "cp1254")
+UNTOLD = (*ONE_BYTE, "shift_jis", "gb18030")
 
 
 def first_bytes(path: Path, count: int = 64) -> bytes:
@@ -123,19 +130,28 @@ def _line(path: Path, text: io.TextIOWrapper) -> str:
     return line
 
 
-def head_of(path: Path, encoding: str = "") -> tuple[str, list[str]]:
-    """Returns (encoding, first lines) of a text; fewer where they are long.
+def head_of(
+    path: Path, encoding: str = "", known: Collection[str] = ()
+) -> tuple[str, bool, list[str]]:
+    """Returns the encoding of a text, whether it is a guess, and its first lines.
+
+    The lines are fewer where they are long.
 
     Args:
       path: file.
       encoding: of its characters; "": recognised.
+      known: names of which the text should hold some; they tell encodings apart.
 
     Raises:
       InputError: an empty file, no text, an unknown encoding, a line without an end.
     """
+    is_guess = False
     if not encoding:
         with unpacked(path) as (stream, _):
-            encoding = _recognised(path, bytes(stream.read(HEAD_BYTES)))
+            data = bytes(stream.read(HEAD_BYTES))
+        encoding = _recognised(path, data)
+        if not encoding:
+            encoding, is_guess = _by_names(data, known)
     lines: list[str] = []
     with _text(path, encoding) as (text, _):
         while len(lines) < HEAD_LINES and sum(map(len, lines)) <= MAX_LINE:
@@ -150,11 +166,26 @@ def head_of(path: Path, encoding: str = "") -> tuple[str, list[str]]:
         raise InputError(
             f"{path}: header: hardly any ASCII as {encoding}: expected a table"
         )
-    return encoding, [line.removesuffix("\n") for line in lines]
+    return encoding, is_guess, [line.removesuffix("\n") for line in lines]
+
+
+def _by_names(data: bytes, known: Collection[str]) -> tuple[str, bool]:
+    """Returns the encoding in which most names are found, and whether it is a guess.
+
+    Args:
+      data: first bytes of a text in one of `UNTOLD`.
+      known: names; those of ASCII alone are alike in all.
+    """
+    names = {name.casefold() for name in known if not name.isascii()}
+    texts = {name: data.decode(name, "replace").casefold() for name in UNTOLD}
+    found = {name: sum(n in text for n in names) for name, text in texts.items()}
+    best = max(UNTOLD, key=lambda name: found[name])  # the first of several
+    is_same = len({texts[name] for name in ONE_BYTE}) == 1
+    return best, not (found[best] or is_same)
 
 
 def _recognised(path: Path, data: bytes) -> str:
-    """Returns the encoding of a text by its first bytes."""
+    """Returns the encoding of a text by its first bytes; "" one of `UNTOLD`."""
     for mark, name in BYTE_ORDERS.items():
         if data.startswith(mark):
             return name
@@ -168,7 +199,7 @@ def _recognised(path: Path, data: bytes) -> str:
     except UnicodeDecodeError as error:
         if b"\0" in data:
             raise InputError(f"{path}: text: {error}: expected a table") from error
-        return "cp1252"
+        return ""
     return "utf-8"
 
 

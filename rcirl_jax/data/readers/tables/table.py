@@ -8,7 +8,7 @@ cell elsewhere is unknown. Every row keeps its line in the file, under `LINE`.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -146,19 +146,22 @@ class Table:
         return []
 
 
-def open_table(path: Path, options: Mapping | None = None) -> Table:
+def open_table(
+    path: Path, options: Mapping | None = None, known: Collection[str] = ()
+) -> Table:
     """Opens a table of any of the forms, its layout recognised.
 
     Args:
       path: file.
       options: [table] of the source TOML, which wins over what is recognised.
+      known: names that the table should hold, which may tell its encoding.
 
     Raises:
       InputError: no table.
     """
     if is_columnar(path):
         return Table(path=path, header=tuple(columns_of(path)))
-    layout, rows = recognise(path, options or {})
+    layout, rows = recognise(path, options or {}, known)
     head = tuple(tuple(row) for row in rows)
     return Table(path=path, header=layout.header, layout=layout, head=head)
 

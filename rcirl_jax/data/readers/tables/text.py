@@ -18,7 +18,7 @@ import functools
 import itertools
 import re
 import string
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +75,7 @@ class Layout:
 
     encoding: str
     delimiter: str
+    is_guess: bool = False  # whether nothing tells the encoding
     quote: str = '"'  # around cells; "": none
     decimal: str = "."
     thousands: str = ""  # between groups of three digits; "": none
@@ -106,18 +107,21 @@ def grouped(mark: str, decimal: str) -> str:
     )
 
 
-def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
+def recognise(
+    path: Path, section: Mapping, known: Collection[str] = ()
+) -> tuple[Layout, list[list[str]]]:
     """Returns the layout of a table, and the cells of its first rows.
 
     Args:
       path: file.
       section: [table] of the source TOML, whose options win.
+      known: names that the text should hold, which may tell its encoding.
 
     Raises:
       InputError: no text, an unknown option, more columns than tables have.
     """
     given = _options(path, section)
-    encoding, lines = head_of(path, given.get("encoding", ""))
+    encoding, is_guess, lines = head_of(path, given.get("encoding", ""), known)
     plain = [line for line in lines if line[:1] not in HASHES and line.strip()]
     cells = re.split(r"[,;|\t]", plain[0]) if plain else []
     # comments are all that is marked above a header without a mark; else the last
@@ -165,6 +169,7 @@ def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
     decimal, thousands = decimal_of(below, delimiter)
     layout = Layout(
         encoding=encoding,
+        is_guess=is_guess,
         delimiter=delimiter,
         quote=quote,
         decimal=given.get("decimal", decimal),
