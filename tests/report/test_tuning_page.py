@@ -255,9 +255,9 @@ def test_a_linear_rewards_shares_are_its_terms(report):
     shares = []
     for row in index:
         one = jax.tree.map(lambda x: x[0], report.dataset.read(np.array([row])))
-        candidates, _, x, mine = _sampled(reward.preset, SamplerConfig())(
-            candidates_key(row), one
-        )
+        program = _sampled(reward.preset, SamplerConfig(), None)
+        candidates, _, both, _ = program(candidates_key(row), one, None)
+        x, mine = both[:-1], both[-1]
         feasible = np.flatnonzero(candidates.feasible)
         at = (np.arange(NUM_CANDIDATES) + 0.5) * feasible.size / NUM_CANDIDATES
         taken = np.asarray(x)[feasible[at.astype(int)]]
