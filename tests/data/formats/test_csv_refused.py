@@ -2,9 +2,11 @@
 
 import gzip
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from rcirl_jax.errors import InputError
 from tests.data.formats import people
 from tests.data.formats.people import HEADER, Way, column, of, refused, rows, text
 from tests.data.formats.test_csv_meaning import wide_frames
@@ -187,3 +189,60 @@ def test_a_table_beside_the_logs_that_is_none(tmp_path):
     assert "`pattern` of the TOML leaves out" in line
     source = people.spec(tmp_path, more='pattern = "log*.csv"')
     people.assert_same(people.only(tmp_path, source))
+
+
+NORTH = ("t", "id", "Northing X", "Easting Y", *people.HEADER[4:])
+
+
+def test_a_mirrored_compass_is_refused(tmp_path):
+    """Surveyors' X is north: as x it mirrors the world, unless one axis is turned."""
+    path = people.write(tmp_path, people.rows(0.4), NORTH)
+    named = dict(zip(people.HEADER, NORTH, strict=True))
+    with pytest.raises(InputError, match="x is called north and y east: swap them"):
+        people.read(path, people.spec(tmp_path, named))
+    turned = {**named, "y": "-Easting Y"}
+    turned.pop("heading")
+    (made,) = people.read(path, people.spec(tmp_path, turned))
+    way = made.tracks[0]
+    rise = np.arctan2(way.y[-1] - way.y[0], way.x[-1] - way.x[0])
+    assert rise == pytest.approx(-0.4, abs=0.01)
+
+
+CURVE = 0.785 + 0.2 * np.sin(np.arange(120) / 40.0)  # rad, direction of travel
+
+
+def curved(folder, convention):
+    """Cars in a slight curve about 45 degrees, where compass and mathematics agree."""
+    sign, zero = {"ccw": (1.0, 0.0), "cw": (-1.0, 90.0)}[convention]
+    table, places = [], {}
+    for k in range(120):
+        turn = CURVE[k]
+        for car in range(4):
+            x, y = places.get(car, (0.0, 40.0 * car))
+            table.append([0.1 * k, f"c{car}", x, y, sign * np.rad2deg(turn) + zero])
+            places[car] = x + 1.5 * np.cos(turn), y + 1.5 * np.sin(turn)
+    return people.write(folder, table, people.HEADER[:5])
+
+
+@pytest.mark.parametrize("convention", ["ccw", "cw"])
+def test_headings_must_turn_as_the_motion_does(tmp_path, convention):
+    """The median offset is small both ways; the turns in the curve tell."""
+    path = curved(tmp_path, convention)
+    names = {"ccw": "ccw_from_x", "cw": "cw_from_north"}
+    units, columns = 'heading = "deg"', people.HEADER[:5]
+    for own, name in names.items():
+        source = people.spec(
+            tmp_path, columns, units, more=f'heading_convention = "{name}"'
+        )
+        if own == convention:
+            (made,) = people.read(path, source)
+            off = made.tracks[0].heading - CURVE
+            assert np.abs(off).max() < 0.02
+            continue
+        with pytest.raises(InputError, match="in curves it turns against") as caught:
+            people.read(path, source)
+        hint = f'"{names[convention]}" with units.heading = "deg" fits'
+        assert hint in str(caught.value)
+    (made,) = people.read(path, people.spec(tmp_path, columns, units))
+    off = made.tracks[0].heading - CURVE
+    assert np.abs(off).max() < 0.02

@@ -352,3 +352,20 @@ def test_an_encoding_that_nothing_tells_is_said(tmp_path):
     assert line in found.lines
     assert toml["table"] == {"encoding": "cp1252"}
     assert 'encoding = "cp1252"  # a guess: another one, such as cp1250' in found.toml
+
+
+@pytest.mark.parametrize(
+    ("header", "x"),
+    [
+        ("Czas Nr Północ_X Wschód_Y", "Wschód_Y"),
+        ("t id Hochwert Rechtswert", "Rechtswert"),
+        ("t id N E", "E"),
+        ("t id Norte Leste", "Leste"),
+        ("t id X_sever Y_vychod", "Y_vychod"),
+        ("t id x_est y_est", "x_est"),  # estimated
+    ],
+)
+def test_names_of_the_compass_count_before_the_letters(header, x):
+    found = fields_by_name(header.split())
+    assert found["x"] == x
+    assert found["y"] in {*header.split()[2:]} - {x}

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.formats.csv.names import words_of
+from rcirl_jax.data.formats.csv.names import compass_axis, words_of
 from rcirl_jax.data.formats.options import UNITS, number, one_of, positive, section
 from rcirl_jax.data.formats.projection import projected
 from rcirl_jax.data.readers.tables.cells import (
@@ -101,6 +101,8 @@ MOVED_M = 1.0  # m in that time; slower road users have none
 ENOUGH = 20  # directions of travel by which a convention is judged
 FITS = math.radians(20.0)  # rad from the direction of travel, in the median
 FITS_WELL = math.radians(8.0)  # rad; what another convention than the usual has to
+TURNED = math.radians(3.0)  # rad from the mean of a road user; less is noise
+ALIKE = 0.7  # correlation of turns at least, or at most its negative
 SURE = math.radians(3.0)  # rad; nearer than this the usual convention is kept
 YES = (
     *("yes", "y", "true", "t", "on", "x", "ja", "j", "oui", "si", "sí", "sim", "sì"),
@@ -217,6 +219,14 @@ def _named(
         raise InputError(
             f"{where}id: {columns['id']}: expected none beside "
             f"columns.x = {columns['x']!r}, whose {HOLE} is the id"
+        )
+    own = {axis: columns[axis].removeprefix("-") for axis in "xy"}
+    is_turned = any(name != columns[axis] for axis, name in own.items())
+    if [compass_axis(own[axis]) for axis in "xy"] == ["y", "x"] and not is_turned:
+        raise InputError(
+            f"{table.path}: columns.x, columns.y: {own['x']}, {own['y']}: x is called "
+            "north and y east: swap them (y must lie left of x); where the names are "
+            "wrong, give others by names of [table]"
         )
     texts = {columns[field] for field in TEXT if field in columns}
     for field, column in columns.items():
@@ -620,31 +630,68 @@ def heading_form(
         used = (np.hypot(dx, dy) > MOVED_M) & (dt < 4.0 * SPAN_S) & np.isfinite(amid)
         if np.sum(used) >= ENOUGH:
             travel = np.arctan2(dy[used], dx[used])
-            return _fitting(path, amid[used], travel, unit, said)
+            users = np.unique(values["id"][middle][used], return_inverse=True)[1]
+            return _fitting(path, amid[used], travel, users, unit, said)
         if headings is None:
             headings = values["heading"]
     by_size = "rad" if headings is None or not is_large(headings) else "deg"
     return HeadingForm(name=said or "ccw_from_x", unit=unit or by_size)
 
 
+def _turning(angles: np.ndarray, travel: np.ndarray, users: np.ndarray) -> float:
+    """Returns 1 if angles turn with the directions of travel in curves, -1 if against.
+
+    The offset of a convention does not matter to it. 0: too little turns, or neither.
+
+    Args:
+      angles: [n] rad.
+      travel: [n] rad, at the same times.
+      users: [n] numbers of the road users, from 0.
+    """
+
+    def turned(values: np.ndarray) -> np.ndarray:
+        """From the mean of the road user."""
+        ways = np.exp(1j * values)
+        east, north = (np.bincount(users, x) for x in (np.cos(values), np.sin(values)))
+        means = east + 1j * north
+        return np.angle(ways * np.conj(means[users]))
+
+    real, found = turned(travel), turned(angles)
+    used = np.abs(real) > TURNED
+    real, found = real[used], found[used]
+    spread = math.sqrt(float(np.sum(real**2) * np.sum(found**2)))
+    alike = float(np.sum(real * found)) / spread if spread else 0.0
+    return (
+        math.copysign(1.0, alike) if real.size >= ENOUGH and abs(alike) > ALIKE else 0.0
+    )
+
+
 def _fitting(
-    path: Path, headings: np.ndarray, travel: np.ndarray, unit: str, said: str
+    path: Path,
+    headings: np.ndarray,
+    travel: np.ndarray,
+    users: np.ndarray,
+    unit: str,
+    said: str,
 ) -> HeadingForm:
-    """The form that fits headings [n] to directions of travel [n] rad."""
+    """The form that fits headings [n] of road users to directions of travel [n] rad."""
     possible = ["deg"] if is_large(headings) else ["rad", "deg"]
 
     def fits(units: Sequence[str], names: Sequence[str]) -> dict[HeadingForm, float]:
-        """Form -> median angle [rad] between headings and directions of travel."""
+        """Form -> median angle [rad] to directions of travel; inf: turns against."""
         found = {}
         for one, name in itertools.product(units, names):
             form = HeadingForm(name=name, unit=one)
-            turn = np.exp(1j * (form.radians(headings) - travel))
-            found[form] = float(np.median(np.abs(np.angle(turn))))
+            angles = form.radians(headings)
+            off = np.abs(np.angle(np.exp(1j * (angles - travel))))
+            is_against = _turning(angles, travel, users) < 0.0
+            found[form] = math.inf if is_against else float(np.median(off))
         return found
 
     apart = fits([unit] if unit else possible, [said] if said else [*CONVENTIONS])
     usual, best = next(iter(apart)), min(apart, key=lambda form: apart[form])
-    if apart[usual] <= max(SURE, 2.0 * apart[best]) or apart[best] > FITS_WELL:
+    is_far = apart[best] > FITS_WELL and math.isfinite(apart[usual])
+    if is_far or apart[usual] <= max(SURE, 2.0 * apart[best]):
         best = usual
     if apart[best] > FITS:
         every = fits(possible, [*CONVENTIONS])
@@ -655,11 +702,14 @@ def _fitting(
                 f'{CONVENTION} = "{right.name}" with units.heading = "{right.unit}" '
                 "fits"
             )
-        raise InputError(
-            f"{path}: heading: {math.degrees(apart[best]):.0f} degrees from the "
-            "direction of travel in the median: expected up to "
-            f"{math.degrees(FITS):.0f}; {hint}"
+        what = (
+            f"{math.degrees(apart[best]):.0f} degrees from the direction of travel in "
+            f"the median: expected up to {math.degrees(FITS):.0f}"
+            if math.isfinite(apart[best])
+            else "in curves it turns against the direction of travel: expected it to "
+            "turn with it, or x and y are mirrored"
         )
+        raise InputError(f"{path}: heading: {what}; {hint}")
     if best == HeadingForm(name=said or "ccw_from_x", unit=unit or "rad"):
         return best
     note = (

@@ -24,7 +24,8 @@ def every_word() -> dict:
 def foreign_words() -> list[str]:
     """Returns the words of fields and kinds that are not of ASCII alone."""
     every = every_word()
-    lists = [*every["fields"].values(), *every["kinds"].values()]
+    sections = (every[name] for name in ("fields", "compass", "kinds"))
+    lists = [words for part in sections for words in part.values()]
     return [word for words in lists for word in words if not word.isascii()]
 
 
@@ -45,6 +46,13 @@ def plain_words(name: str) -> list[str]:
 def with_unit_apart(name: str) -> str:
     """Returns "headX [ft]" of "headXft": a unit that is glued to a coordinate."""
     return re.sub(r"([XY])(ft|m|cm|px|pix|pixels?)$", r"\1 [\2]", name)
+
+
+def compass_axis(name: str) -> str:
+    """Returns x for a name that says east, y for one that says north; "" for others."""
+    words = set(plain_words(name))
+    said = [axis for axis, own in every_word()["compass"].items() if words & {*own}]
+    return said[0] if len(said) == 1 else ""
 
 
 def is_no_place(name: str, header: Sequence[str]) -> bool:
@@ -79,7 +87,11 @@ def fields_by_name(header: Sequence[str]) -> dict[str, str]:
     met = [word for own in words.values() for word in set(own)]
     common = {w for w in met if len(words) > 3 and met.count(w) > len(words) / 2}
     found: dict[str, str] = {}
-    for field, known in every_word()["fields"].items():
+    axes = {name: compass_axis(name) for name in words}
+    if not {"x", "y"} <= {*axes.values()}:  # one alone may be another word: x_est
+        axes = {}
+    for field, letters in every_word()["fields"].items():
+        known = [*letters, *every_word()["compass"].get(field, ())]
         scores = {}  # how badly a name fits: words too many, and how unlikely it is
         for name, every in words.items():
             own = [word for word in every if word not in common] or every
@@ -88,7 +100,7 @@ def fields_by_name(header: Sequence[str]) -> dict[str, str]:
                 field in ("x", "y", "lat", "lon")
                 and not set(every_word()["motion"]).isdisjoint(own)
             )
-            if name in found.values():
+            if name in found.values() or axes.get(name, "") not in ("", field):
                 continue
             last = field in ("x", "y") and is_no_place(name, header)
             if (joined := "".join(own)) in known:
