@@ -12,6 +12,8 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.score import PriorCostScorer, RankingSetup
+from rcirl_jax.export.own_planner.choose import check_times
+from rcirl_jax.export.own_planner.features import FeatureError
 from rcirl_jax.export.reader import (
     FAMILIARITY,
     RANGES,
@@ -43,7 +45,7 @@ def open_reward(path: str) -> Reward:
     """Read a weights file whose features are those this package computes.
 
     Raises:
-      InputError: unreadable or damaged file, other features or units, or a
+      InputError: unreadable or damaged file, other features, units or times, or a
         provenance of other types.
     """
     try:
@@ -59,7 +61,7 @@ def features_of(reward: Reward) -> FeatureMap:
     """Return the features that a reward reads, as this package computes them.
 
     Raises:
-      InputError: it computes others, or with other units.
+      InputError: it computes others, with other units or at other times.
     """
     known = known_presets()
     if reward.preset not in known:
@@ -70,7 +72,8 @@ def features_of(reward: Reward) -> FeatureMap:
     features = feature_map(reward.preset)
     try:
         reward.check_features(features.names, [s.unit for s in features.specs])
-    except WeightsError as error:
+        check_times(reward)
+    except (WeightsError, FeatureError) as error:
         raise InputError(str(error)) from error
     return features
 

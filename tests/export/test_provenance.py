@@ -8,10 +8,13 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.export import pack
 from rcirl_jax.export.from_run import datasets_of
 from rcirl_jax.export.loading import open_reward
+from rcirl_jax.export.reader import load_weights
 from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.units import TIMES_S
 from tests.helpers import weights_files
 from tests.helpers.commands import refused
+from tests.helpers.weights_files import SPECS
 
 
 def with_provenance(tmp_path, monkeypatch, **entries):
@@ -44,6 +47,20 @@ def test_features_that_no_package_has(tmp_path, preset):
     path.write_bytes(pack(made, *weights_files.example_samples(made)))
     with pytest.raises(
         InputError, match=rf"w\.msgpack: preset: {preset}: expected one of apollo21, "
+    ):
+        open_reward(str(path))
+
+
+@pytest.mark.parametrize("times", [3.0 * TIMES_S, TIMES_S[:10]])
+def test_times_that_no_trajectory_here_has(tmp_path, times):
+    """The file itself is whole: only what ranks or drives here refuses it."""
+    made = weights_files.example_weights(features=len(SPECS), times=len(times))
+    made = weights_files.of_the_preset(made, times=times.astype("f4"))
+    path = tmp_path / "w.msgpack"
+    path.write_bytes(pack(made, *weights_files.example_samples(made)))
+    assert load_weights(path).times.size == len(times)
+    with pytest.raises(
+        InputError, match=r"w\.msgpack: times: another grid: expected 8 i / 17 s"
     ):
         open_reward(str(path))
 

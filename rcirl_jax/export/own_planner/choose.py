@@ -106,6 +106,17 @@ def _rulings(
         return rules.explain(given.scene, candidates, safety)
 
 
+def check_times(reward: Any) -> None:  # noqa: ANN401
+    """Refuses a reward of another time grid than that of the features.
+
+    Raises:
+      FeatureError: it has one.
+    """
+    times = np.asarray(reward.times)
+    if times.shape != TIMES_S.shape or np.abs(times - TIMES_S).max() > SAME_TIMES_S:
+        _fail(f"{reward.file}: times", "another grid", "8 i / 17 s, i = 0 .. 17")
+
+
 def choose(
     reward: Any,  # noqa: ANN401
     scene: features.Scene,
@@ -142,9 +153,7 @@ def choose(
         weights trained along one path (`mode`); a prior cost without own values, or
         with a guard.
     """
-    times = np.asarray(reward.times)
-    if times.shape != TIMES_S.shape or np.abs(times - TIMES_S).max() > SAME_TIMES_S:
-        _fail(f"{reward.file}: times", "another grid", "8 i / 17 s, i = 0 .. 17")
+    check_times(reward)
     given = features.driven(scene, s, l)
     _check_edges(scene, l)
     _check_start(given, ("s",) if l is None else ("s", "l"))
