@@ -31,7 +31,7 @@ _CASE = flags.DEFINE_string(
 )
 _ROW = flags.DEFINE_enum("row", "learned", ["learned", "dp", *BASELINES], "who drives")
 _DURATION = flags.DEFINE_float("duration", FULL_S, "s of the drive, 1 to 120")
-_EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
+_EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans", 1)
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
 
 

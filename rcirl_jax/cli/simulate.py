@@ -101,7 +101,7 @@ def main() -> None:
         print(said)
     if of_data and places.workers > 1:
         raise InputError(f"--suite: {suite}: expected --workers=1: drives run here")
-    if of_data and asked["duration_s"]:
+    if of_data and asked["duration_s"] is not None:
         raise InputError(f"--duration: of --suite={suite}: they last as their records")
     if _DATA.value and not of_data:
         known = " or ".join(OF_DATA)

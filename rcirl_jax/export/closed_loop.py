@@ -255,6 +255,11 @@ class SuiteJob:
     # programs that plan: names of their rows, "" for their own, and commands
     planners: tuple[tuple[str, str], ...] = ()
 
+    def __post_init__(self) -> None:
+        """Refuses plans that are never made."""
+        if self.plan_every < 1:
+            raise InputError(f"plan_every: {self.plan_every}: expected at least 1")
+
     def rows(self) -> list[Row]:
         """A gate's candidate, learned rows, planners, then the baselines."""
         rows = table_rows(
@@ -487,8 +492,10 @@ def judged(
       drives: of them, in all.
 
     Raises:
-      InputError: drives that do not repeat, or too few cases.
+      InputError: drives that do not repeat, too few cases or held-out drives.
     """
+    if drives < 1:
+        raise InputError(f"drives: {drives}: expected at least 1")
     result, report = drive_job(job, executor), None
     if sources:
         recorded = held_out(sources, drives)

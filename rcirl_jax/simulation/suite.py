@@ -112,7 +112,8 @@ def case_duration(suite: str, given: float | None) -> float:
     Raises:
       InputError: none that a case can have.
     """
-    duration = given or (SMOKE_S if suite == "smoke" else FULL_S)
+    usual = SMOKE_S if suite == "smoke" else FULL_S
+    duration = usual if given is None else given
     if not 1.0 <= duration <= FULL_S:
         raise InputError(f"duration_s: {duration}: expected 1 to {FULL_S:g} s")
     return duration
