@@ -553,8 +553,9 @@ def within_limits(
 ) -> jax.Array:
     """True if one trajectory respects the vehicle's limits at its valid times.
 
-    a in [min, max], |j|, |kappa|, |v^2 kappa| bounded; v >= 0 holds by
-    construction. Times outside the scene's mask and t = 0 (given) do not count.
+    a in [min, max], |j|, |kappa|, |v^2 kappa| bounded. v is not: it can be some tenths
+    of a m/s below 0 at the end of a stop. Times outside the scene's mask and t = 0
+    (given) do not count.
     """
     kappa = driven_curvature(scene, trajectory)
     ok = (
