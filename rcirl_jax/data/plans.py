@@ -71,22 +71,26 @@ def plan_of(recording: Recording, graph: LaneGraph) -> dict[str, Any]:
 def changes_of_lane(track: Track, graph: LaneGraph) -> list[list[float]]:
     """Returns the places [x, y] m at which a driver comes onto the lane beside.
 
-    A lane counts once the driver has been on it for STAYS_S; successors of a lane are
-    the same lane.
+    Pieces that follow each other are one lane. It counts once the driver has been on
+    it for STAYS_S.
     """
     names = graph.match(track.x, track.y, track.heading)
-    runs = [0, *(np.flatnonzero(names[1:] != names[:-1]) + 1).tolist(), len(names)]
-    found, before = [], ""
+    rows = np.flatnonzero(names != "")
+    lanes = graph.lines()
+    numbers = np.array([lanes[name] for name in names[rows]], int)
+    runs = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(rows)]
+    found: list[list[float]] = []
+    before: list[str] = []  # pieces that were driven last on one lane
     for first, last in itertools.pairwise(runs):
-        name = str(names[first])
-        if not name or track.t[last - 1] - track.t[first] < STAYS_S:
+        if first == last or track.t[rows[last - 1]] - track.t[rows[first]] < STAYS_S:
             continue
-        if before and name != before:
-            lanes = [graph.lanes[before]]
-            lanes += [graph.lanes[x] for x in lanes[0].successors if x in graph.lanes]
-            if any(name in (lane.left, lane.right) for lane in lanes):
-                found.append([round(float(x[first]), 1) for x in (track.x, track.y)])
-        before = name
+        driven = list(dict.fromkeys(names[rows[first:last]].tolist()))
+        if before and lanes[before[0]] != lanes[driven[0]]:
+            beside = graph.beside_line(before[0])
+            if not graph.follows(before, driven) and beside.intersection(driven):
+                row = rows[first]
+                found.append([round(float(x[row]), 1) for x in (track.x, track.y)])
+        before = driven
     return found
 
 

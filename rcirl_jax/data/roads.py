@@ -12,7 +12,7 @@ ends, the lane on which its drivers go on is its successor.
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -36,6 +36,11 @@ COVERED = 0.45  # of a lane's width: positions nearer to a lane need no other
 JOIN_M = 1.2  # m between lanes that have become one
 BLEND_M = 24.0  # m in which a lane that joins another comes onto its middle
 TAPER_M = 60.0  # m, likewise of one that ends beside it
+PARALLEL_M = 25.0  # m, shortest way that lanes run side by side
+PARALLEL = (0.75, 1.35)  # of a lane's width between the middles of lanes side by side
+SPREAD_M = 0.3  # m that their distance varies by at most over PARALLEL_M
+DRIFT_M = 0.2  # m nearer to the neighbour, from which a lane's end drifts onto it
+DRIFTS_M = 100.0  # m of a lane's end that may
 SHORTEST_M = (25.0, 15.0, 3.0)  # m of a lane that joins others at so many ends
 MIN_PIECE_M = 15.0  # m, shortest piece that a neighbour's begin or end makes
 EXTRA_M = 20.0  # m of lane beyond the first and last position
@@ -369,20 +374,20 @@ class _Link:
     at: int  # point of the other where the two are one
 
 
-def _led_onto(
-    ridges: Sequence[_Ridge], number: int, is_end: bool, other: int, blend: float
-) -> _Link:
-    """Leads the end of a ridge onto the middle of another; returns where it is there.
+def _led_onto(ridge: _Ridge, is_end: bool, target: np.ndarray, blend: float) -> int:
+    """Leads the end of a ridge onto the middle of another.
 
     Args:
-      ridges: all; the ridge's line is replaced by a longer one.
-      number: of the ridge.
+      ridge: its line is replaced by a longer one.
       is_end: its end; else its start.
-      other: number of the ridge that it joins.
+      target: [m, 2] m, the line of the ridge that it joins.
       blend: m in which it does.
+
+    Returns:
+      The target's point at which the two are one.
     """
-    ridge, sense = ridges[number], 1 if is_end else -1
-    line, target = ridge.line[::sense], ridges[other].line[::sense]
+    sense = 1 if is_end else -1
+    line, target = ridge.line[::sense], target[::sense]
     (begin,), (left,) = _left_of(target, line[-1:])
     slope = float(_cross(_ways(target)[begin], _ways(line)[-1]))
     if left * slope < 0.0:  # as long as it takes at the angle at which they meet
@@ -394,8 +399,70 @@ def _led_onto(
     rest = left * (1.0 - share * share * (3.0 - 2.0 * share))
     onto = target[begin + 1 : last + 1] + rest * normal
     ridge.line = np.concatenate([line, onto])[::sense]
-    at = last if is_end else len(target) - 1 - last
-    return _Link(ridge=number, is_end=is_end, other=other, at=int(at))
+    return int(last if is_end else len(target) - 1 - last)
+
+
+def _ends_beside(
+    ridge: _Ridge, is_end: bool, target: np.ndarray, width: float, samples: _Samples
+) -> bool:
+    """Ends a ridge beside another one if the two run side by side before.
+
+    Where it drifts onto the other, drivers change lanes: from there it goes along the
+    other, as far as some still drive on it and EXTRA_M beyond.
+
+    Args:
+      ridge: its line is replaced.
+      is_end: its end; else its start.
+      target: [m, 2] m, the line of the ridge on which its drivers go on.
+      width: m between lanes that adjoin.
+      samples: of all ridges.
+
+    Returns:
+      False if the two do not run side by side; then nothing is changed.
+    """
+    sense = 1 if is_end else -1
+    line, target = ridge.line[::sense], target[::sense]
+    first = max(len(line) - round((DRIFTS_M + PARALLEL_M) / STEP_M), 0)
+    at, left = _left_of(target, line[first:])
+    is_beside = (at > 0) & (at < len(target) - 1)
+    is_beside &= np.sum(_ways(target)[at] * _ways(line)[first:], axis=1) > np.cos(0.15)
+    low, high = PARALLEL[0] * width, PARALLEL[1] * width
+    is_beside &= (np.abs(left) > low) & (np.abs(left) < high)
+    size = round(PARALLEL_M / STEP_M)
+    for end in range(len(at), size - 1, -1):  # the last way side by side
+        begin = end - size
+        if is_beside[begin:end].all() and np.ptp(left[begin:end]) < SPREAD_M:
+            break
+    else:
+        return False
+    others = np.flatnonzero(~is_beside[:begin])
+    begin = int(others[-1]) + 1 if others.size else 0
+    gap = float(np.median(left[begin:end]))
+    if np.any(np.abs(left[end:]) > high):  # it leaves the other
+        return False
+    close = is_beside[begin:] & (np.abs(left[begin:] - gap) < DRIFT_M)
+    end = begin + np.flatnonzero(close)[-1] + 1
+    onto = slice(at[end - 1] + 1, at[end - 1] + 1 + round(2.0 * DRIFTS_M / STEP_M))
+    ways = _ways(target)[onto]
+    back = np.exp(-np.arange(len(ways)) / 10.0)[:, None]
+    normal = np.stack([-ways[:, 1], ways[:, 0]], axis=1)
+    beyond = target[onto] + (gap + (left[end - 1] - gap) * back) * normal
+    beyond = beyond[: _driven(beyond, sense * ways, samples) + round(EXTRA_M / STEP_M)]
+    ridge.line = _smoothed(np.concatenate([line[: first + end], beyond])[::sense])
+    return True
+
+
+def _driven(line: np.ndarray, ways: np.ndarray, samples: _Samples) -> int:
+    """Returns the number of a line's first points that two or more drive along."""
+    if not len(line):
+        return 0
+    apart, at = _query(line, samples.place, JOIN_M)
+    near = np.flatnonzero(np.isfinite(apart))
+    near = near[np.sum(ways[at[near]] * samples.way[near], axis=1) > SAME_WAY]
+    size = round(2.0 * ALONG_M / STEP_M)
+    there = np.unique(np.stack([at[near] // size, samples.track[near]]), axis=1)[0]
+    alone = np.bincount(there, minlength=len(line) // size + 1) < 2
+    return size * int(np.argmax(alone)) if alone.any() else len(line)
 
 
 def _on(
@@ -496,6 +563,12 @@ def _beside(ridges: Sequence[_Ridge], width: float) -> list[_Beside]:
     return found
 
 
+def _spacing(beside: Sequence[_Beside]) -> float:
+    """Returns m between the middles of lanes that adjoin; NaN where none do."""
+    apart = np.concatenate([x.apart[np.isfinite(x.apart)] for x in beside])
+    return float(np.median(apart)) if apart.size else np.nan
+
+
 def _changes(beside: _Beside) -> list[int]:
     """Returns the points where a neighbour begins or ends for good."""
     found = []
@@ -511,10 +584,88 @@ def _changes(beside: _Beside) -> list[int]:
     return found
 
 
+def _on_those(
+    ridges: Sequence[_Ridge], ended: Collection[int], width: float
+) -> set[int]:
+    """Returns the ridges that lie on a longer one of `ended`: strays of its drivers."""
+    found = set()
+    for number, ridge in enumerate(ridges):
+        for other in {*ended} - {number}:
+            line = ridges[other].line
+            if len(line) <= len(ridge.line):
+                continue
+            apart, at = _query(line, ridge.line)
+            same = np.sum(_ways(line)[at] * _ways(ridge.line), axis=1) > SAME_WAY
+            if np.median(np.where(same, apart, np.inf)) < 0.65 * width:
+                found.add(number)
+    return found
+
+
+def _connected(
+    ridges: list[_Ridge], samples: _Samples, width: float
+) -> tuple[set[tuple[int, bool]], list[_Link]]:
+    """Leads the ends of ridges onto those that follow, or leaves them beside these.
+
+    Args:
+      ridges: all; their lines are replaced.
+      samples: that they are made of.
+      width: m of a lane, where none adjoins.
+
+    Returns:
+      (ridges that end beside another, and whether it is their end; the links).
+    """
+    spacing = _spacing(_beside(ridges, width))
+    apart = width if np.isnan(spacing) else float(np.clip(spacing, *WIDTHS_M))
+    on, known = _on(ridges, samples, width), [ridge.line for ridge in ridges]
+    found = [dataclasses.replace(ridge) for ridge in ridges]
+    ended: set[tuple[int, bool]] = set()
+    leads: list[tuple[int, bool, int, float]] = []
+    for number, ridge in enumerate(found):
+        for is_end in (True, False):
+            other, blend = ridge.ends[is_end], BLEND_M
+            if other < 0:
+                other, blend = _votes(found, number, is_end, samples, on), TAPER_M
+            beyond = _beyond_a_gap(found, number) if is_end else -1
+            if other >= 0 and other != number:
+                own = dataclasses.replace(ridges[number])
+                if _ends_beside(own, is_end, known[other], apart, samples):
+                    other = beyond
+                    if beyond < 0:
+                        ridges[number].line = own.line
+                        ended.add((number, is_end))
+            elif other < 0:
+                other = beyond
+            if other >= 0:
+                leads.append((number, is_end, other, blend))
+    if short := _on_those(ridges, {number for number, _ in ended}, apart):
+        kept = [number for number in range(len(found)) if number not in short]
+        new = {old: number for number, old in enumerate(kept)}
+        ridges[:] = [
+            dataclasses.replace(found[n], ends=[new.get(x, -1) for x in found[n].ends])
+            for n in kept
+        ]
+        return _connected(ridges, samples, width)
+    known = [ridge.line for ridge in ridges]
+    joins = []
+    for number, is_end, other, blend in leads:
+        if other == number:  # a circle
+            place = known[number][0 if is_end else -1]
+        else:
+            at = _led_onto(ridges[number], is_end, known[other], blend)
+            place = known[other][at]
+        joins.append(place)
+    links = []
+    for (number, is_end, other, _), place in zip(leads, joins, strict=True):
+        at = int(_query(ridges[other].line, place)[1])
+        links.append(_Link(ridge=number, is_end=is_end, other=other, at=at))
+    return ended, links
+
+
 def _pieces(
     ridges: Sequence[_Ridge],
     beside: Sequence[_Beside],
     links: Sequence[_Link],
+    ended: Collection[tuple[int, bool]],
     width: float,
     limit: float | None,
 ) -> tuple[Lane, ...]:
@@ -524,6 +675,7 @@ def _pieces(
       ridges: all.
       beside: of each.
       links: of all.
+      ended: ridges, and whether it is their end, that end beside another.
       width: m, where no lane is beside.
       limit: m/s, or None.
     """
@@ -586,9 +738,10 @@ def _pieces(
                 point = own.point[side, rows[len(rows) // 2]]
                 names.append(piece_at(most, int(point)))
             line, widths = ridge.line[a : b + 1], half[:, a : b + 1]
+            closed = {*ended} | {(link.ridge, link.is_end) for link in links}
             free = [
-                a == 0 and not _is_linked(links, number, is_end=False),
-                b == mine[-1] and not _is_linked(links, number, is_end=True),
+                a == 0 and (number, False) not in closed,
+                b == mine[-1] and (number, True) not in closed,
             ]
             line, widths = _longer(line, widths, *free)
             lanes.append(
@@ -605,10 +758,6 @@ def _pieces(
                 )
             )
     return tuple(lanes)
-
-
-def _is_linked(links: Sequence[_Link], number: int, *, is_end: bool) -> bool:
-    return any(link.ridge == number and link.is_end == is_end for link in links)
 
 
 def _longer(
@@ -731,34 +880,18 @@ def roads_from_tracks(
     fewest = 2 if np.unique(samples.track).size >= 20 else 1
     tracer = _Tracer(samples, width, fewest)
     tracer.run()
-    ridges, links = tracer.ridges, []
+    ridges = tracer.ridges
     if not ridges:
         return Roads(lanes=(), explained=0.0, width=np.nan)
     for ridge in ridges:
         _refined(ridge, samples)
-    known = [ridge.line for ridge in ridges]
-    on = _on(ridges, samples, width)
-    for number, ridge in enumerate(ridges):
-        for is_end in (False, True):
-            other, blend = ridge.ends[is_end], BLEND_M
-            if other < 0:
-                other, blend = _votes(ridges, number, is_end, samples, on), TAPER_M
-            if other < 0 and is_end:
-                other = _beyond_a_gap(ridges, number)
-            if other == number:  # a circle
-                at = 0 if is_end else len(ridge.line) - 1
-                links.append(_Link(ridge=number, is_end=is_end, other=number, at=at))
-            elif other >= 0:
-                lined = dataclasses.replace(ridge, line=known[other])
-                others = [*ridges[:other], lined, *ridges[other + 1 :]]
-                links.append(_led_onto(others, number, is_end, other, blend))
+    ended, links = _connected(ridges, samples, width)
     beside = _beside(ridges, width)
-    apart = np.concatenate([x.apart[np.isfinite(x.apart)] for x in beside])
-    spacing = float(np.median(apart)) if apart.size else np.nan
-    found = float(np.clip(spacing, *WIDTHS_M)) if apart.size else width
+    spacing = _spacing(beside)
+    found = width if np.isnan(spacing) else float(np.clip(spacing, *WIDTHS_M))
     on, _ = _on(ridges, samples, found)
     return Roads(
-        lanes=_pieces(ridges, beside, links, found, limit),
+        lanes=_pieces(ridges, beside, links, ended, found, limit),
         explained=float(np.mean(on >= 0)),
         width=spacing,
     )

@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
+from rcirl_jax.data.plans import changes_of_lane
 from rcirl_jax.data.roads import roads_from_tracks
+from rcirl_jax.data.scenes.lanes import LaneGraph, project
+from rcirl_jax.types import Recording
 from tests.data.formats.fixtures.drives import straight
-from tests.helpers.driven_roads import country_road, crossing, highway
+from tests.helpers.driven_roads import country_road, crossing, highway, motorway
 
 DRIVEN = {
     "two lanes and a slip road": highway(),
     "four narrow lanes": highway(1, lanes=4, width=3.1),
+    "a motorway": motorway(),
     "a country road": country_road(),
     "a crossing": crossing(),
 }
@@ -72,7 +76,11 @@ def test_there_is_no_lane_that_nobody_drives_on(case):
 def test_widths_and_neighbours(case):
     name, _, roads = case
     by_id = {lane.id: lane for lane in roads.lanes}
-    width = {"two lanes and a slip road": 3.6, "four narrow lanes": 3.1}.get(name)
+    width = {
+        "two lanes and a slip road": 3.6,
+        "four narrow lanes": 3.1,
+        "a motorway": 3.5,
+    }.get(name)
     if width is None:
         assert np.isnan(roads.width)
         assert all(lane.left is lane.right is None for lane in roads.lanes)
@@ -101,15 +109,89 @@ def test_successors_go_on_where_a_lane_ends(case):
             assert out @ onto > 0.7 * np.hypot(*out) * np.hypot(*onto)
 
 
-def test_a_slip_road_leads_onto_the_road_and_a_crossing_to_three_arms():
-    for name, begin, ends in (
-        ("two lanes and a slip road", "slip", ["0"]),
-        ("a crossing", "0 on", ["0 on", "0 left", "0 right"]),
-    ):
-        lines, roads = DRIVEN[name].lanes, roads_from_tracks(DRIVEN[name].tracks)
-        reached = roads_reached(roads, roads_lane_at(roads, lines[begin][5]))
-        for end in ends:
-            assert roads_lane_at(roads, lines[end][-5]).id in reached, (name, end)
+def test_a_crossing_leads_to_three_arms():
+    lines, roads = (
+        DRIVEN["a crossing"].lanes,
+        roads_from_tracks(DRIVEN["a crossing"].tracks),
+    )
+    reached = roads_reached(roads, roads_lane_at(roads, lines["0 on"][5]))
+    for end in ("0 on", "0 left", "0 right"):
+        assert roads_lane_at(roads, lines[end][-5]).id in reached, end
+
+
+def graph_of(roads):
+    options = {"name": "made", "source": "made", "licence": "MIT", "rate_hz": 12.5}
+    return LaneGraph(Recording(**options, tracks=(), lanes=roads.lanes))
+
+
+@pytest.fixture(scope="module")
+def motorway_roads():
+    driven = DRIVEN["a motorway"]
+    return driven, roads_from_tracks(driven.tracks)
+
+
+@pytest.mark.parametrize(
+    ("name", "lane", "at", "side"),
+    [
+        ("two lanes and a slip road", "slip", -1, "left"),
+        ("a motorway", "slip", -1, "left"),
+        ("a motorway", "2", 0, "right"),
+    ],
+)
+def test_a_lane_ends_or_begins_beside_another(name, lane, at, side):
+    """It is no fork and no join: who merges changes lanes."""
+    lines, roads = DRIVEN[name].lanes, roads_from_tracks(DRIVEN[name].tracks)
+    last = roads_lane_at(roads, lines[lane][at + (5 if at == 0 else -4)])
+    if at:
+        assert last.successors == ()
+    else:
+        assert all(last.id not in other.successors for other in roads.lanes)
+    assert getattr(last, side) is not None
+    end, true = last.centre[at], lines[lane]
+    assert np.hypot(*(end - true[at])) < 70.0
+    way = np.diff(last.centre, axis=0)
+    turn = np.abs(np.diff(np.unwrap(np.arctan2(way[:, 1], way[:, 0]))))
+    assert np.max(turn / np.hypot(*way[1:].T)) < 0.01  # 1/m, no swerve
+
+
+def test_an_exit_leads_off_its_lane(motorway_roads):
+    driven, roads = motorway_roads
+    reached = roads_reached(roads, roads_lane_at(roads, driven.lanes["0"][400]))
+    assert roads_lane_at(roads, driven.lanes["exit"][-5]).id in reached
+    assert roads_lane_at(roads, driven.lanes["0"][-5]).id in reached
+    assert roads_lane_at(roads, driven.lanes["2"][-5]).id not in reached
+
+
+def test_changes_of_lane_are_found_where_they_are(motorway_roads):
+    driven, roads = motorway_roads
+    graph = graph_of(roads)
+    found = {x.id: changes_of_lane(x, graph) for x in driven.tracks}
+    true = {x.id: [] for x in driven.tracks}
+    for name, place in driven.changes:
+        true[name].append(place)
+    hits = sum(
+        any(np.hypot(*(place - other)) < 40.0 for other in found[name])
+        for name, place in driven.changes
+    )
+    assert len(driven.changes) > 60
+    assert hits >= 0.95 * len(driven.changes)
+    assert hits >= 0.95 * sum(len(places) for places in found.values())
+
+
+def test_who_merges_is_described_along_the_lane_that_ends(motorway_roads):
+    """The line goes on beside the road, and its room closes."""
+    driven, roads = motorway_roads
+    graph = graph_of(roads)
+    chain = graph.chain(roads_lane_at(roads, driven.lanes["slip"][300]).id, ())
+    frame = graph.frame(chain)
+    s, left = project(frame, *driven.lanes["0"][200:700].T)
+    assert np.all(np.diff(s) > 0.5)
+    assert s[-1] < frame.length
+    assert np.median(left) == pytest.approx(3.5, abs=0.15)
+    assert np.ptp(left) < 0.8
+    stations = s[[50, -100]]
+    assert frame.table("road_right", stations) == pytest.approx([-1.75, 1.75], abs=0.2)
+    assert np.max(np.abs(frame.kappa[20 : int(frame.length) - 20])) < 0.006
 
 
 def roads_lane_at(roads, place):

@@ -130,6 +130,58 @@ def highway(seed=0, *, minutes=6.0, lanes=2, width=3.6, share=0.14, noise=0.15):
     return found
 
 
+def motorway(seed=0, *, minutes=6.0, width=3.5):
+    """Two lanes that bend to the right, between a slip road, an exit and a third lane.
+
+    The slip road runs beside the right lane from 170 m and ends at 370 m. The exit
+    leaves that lane at 620 m, and who takes it makes no step to the side. A third lane
+    begins on the left at 450 m. `changes` are (track, place [2] m) over a lane's edge.
+
+    Args:
+      seed: of the traffic.
+      minutes: of traffic.
+      width: m of each lane.
+    """
+    rng, s = np.random.default_rng(seed), np.arange(901.0)
+    kappa = -np.sin(np.clip((s - 50.0) / 800.0, 0.0, 1.0) * np.pi) / 450.0
+    road = curve(s, kappa, (-20.0, 40.0), 1.1)
+    slip = -width - 16.0 * (1.0 - ramp(s, -60.0, 230.0))
+    exits = -(np.maximum(s - 620.0, 0.0) ** 2) / 1400.0
+    lines = {"slip": slip, "0": 0.0 * s, "1": 0.0 * s + width, "exit": exits}
+    lines["2"] = 0.0 * s + 2.0 * width
+    found = Driven([], {name: beside(*road, left) for name, left in lines.items()})
+    found.lanes["slip"] = found.lanes["slip"][:371]
+    found.lanes["2"] = found.lanes["2"][495:]  # the first have changed to it there
+
+    def add(speed, start, first, last, begin):
+        name, length = str(len(found.tracks)), speed * rng.uniform(3.5, 6.0)
+        share = ramp(s, begin, length)
+        left = lines[first] * (1.0 - share) + lines[last] * share
+        found.tracks.append(
+            drive(rng, name, road, lambda at: np.interp(at, s, left), speed, start)
+        )
+        if first != last and last != "exit":
+            at = int(np.argmax(share > 0.5))
+            found.changes.append((name, beside(*road, left)[at]))
+
+    for lane, every in (("slip", 11.0), ("0", 5.0), ("1", 5.0)):
+        start = rng.uniform(0.0, 5.0)
+        while start < 60.0 * minutes:
+            speed, begin = rng.uniform(20.0, 30.0), rng.uniform(100.0, 600.0)
+            other = lane
+            if lane == "slip":
+                speed, begin, other = rng.uniform(17.0, 23.0), 170.0, "0"
+                begin += 150.0 * rng.beta(2.0, 2.0)
+            elif rng.random() < 0.3:
+                other = {"0": "exit", "1": "2"}[lane]
+                begin = -500.0 if other == "exit" else rng.uniform(450.0, 620.0)
+            elif rng.random() < 0.25:
+                other = {"0": "1", "1": "0"}[lane]
+            add(speed, start, lane, other, begin)
+            start += rng.exponential(every) + 1.5
+    return found
+
+
 def country_road(seed=0, *, minutes=5.0, radius=60.0, width=3.4):
     """A lane each way through a tight S."""
     rng, s = np.random.default_rng(seed), np.arange(401.0)

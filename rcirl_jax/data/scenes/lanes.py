@@ -2,8 +2,10 @@
 
 A chain is the sequence of lanes a driver follows: the lane at the planning
 frame, its predecessors behind and, at every fork ahead, the branch the driver
-took. Its centre line is the scene's reference line. Scenes of many drivers
-share a chain, so everything that depends on it alone is computed once.
+took. Its centre line is the scene's reference line. Where the last lane ends beside
+one that goes on, so does the reference line, as far from that lane as before: a
+driver who merges changes lanes in one frame. Scenes of many drivers share a chain,
+so everything that depends on it alone is computed once.
 """
 
 import collections
@@ -25,6 +27,8 @@ AHEAD_M = 400.0  # m of chain kept beyond that lane
 MAX_HEADING_GAP = np.deg2rad(60.0)  # rad, a car heads along its lane within this
 SAME_PLACE_M = 1.0  # m, points of lanes that are nearer lie on each other
 MATCH_NEIGHBOURS = 12  # nearest centre points looked at per position
+TURN_M = 20.0  # m in which a line that goes on turns along the lane beside it
+CLOSING_M = 60.0  # m in which the room of a lane that has ended closes
 LINE_STEP_M = 1.0  # m, grid of the reference line
 LINE_SIZES = (256, 512, 1024, 2048, 4096)  # static sizes; few compilations
 
@@ -88,6 +92,7 @@ class LaneGraph:
             lane.id: float(_arc(lane.centre)[-1]) for lane in recording.lanes
         }
         self._frames: dict[tuple[str, ...], LaneFrame] = {}
+        self._lines: dict[str, int] = {}  # filled by `lines`
 
     def match(self, x: np.ndarray, y: np.ndarray, heading: np.ndarray) -> np.ndarray:
         """Lane id per position of one track ("" where the car is on none).
@@ -167,22 +172,66 @@ class LaneGraph:
 
         return min(options, key=bend)
 
+    def lines(self) -> Mapping[str, int]:
+        """Returns the number of the line that each lane is a piece of (cached).
+
+        A lane goes on in its straightest successor, unless that goes on for another.
+        """
+        if not self._lines:
+            after, before = {}, {}
+            for name, lane in self.lanes.items():
+                options = [x for x in lane.successors if x in self.lanes]
+                after[name] = self._pick(options, name, {}, forward=True)
+                options = self.predecessors[name]
+                before[name] = self._pick(options, name, {}, forward=False)
+            for number, name in enumerate(self.lanes):
+                here = name
+                while here is not None and here not in self._lines:
+                    self._lines[here] = number
+                    there = after[here]
+                    here = there if there and before[there] == here else None
+                here = before[name]
+                while here and here not in self._lines and after[here] == name:
+                    self._lines[here] = number
+                    name, here = here, before[here]
+        return self._lines
+
+    def beside_line(self, name: str) -> frozenset[str]:
+        """Returns the neighbours of all pieces of a lane's line."""
+        lines = self.lines()
+        pieces = [self.lanes[x] for x, line in lines.items() if line == lines[name]]
+        found = {x for lane in pieces for x in (lane.left, lane.right) if x}
+        return frozenset(found)
+
+    def follows(self, before: Iterable[str], after: Iterable[str]) -> bool:
+        """Returns whether one of the lanes leads into one of those after."""
+        after = {*after}
+        leads = (x for name in before for x in self.lanes[name].successors)
+        return not after.isdisjoint(leads)
+
     def frame(self, chain: tuple[str, ...]) -> LaneFrame:
         """Return the Frenet frame of a chain (cached)."""
         if chain in self._frames:
             return self._frames[chain]
         lanes = [self.lanes[name] for name in chain]
-        points = np.concatenate([lane.centre for lane in lanes])
+        behind, ahead = self._beyond(lanes[0], -1), self._beyond(lanes[-1], 1)
+        parts = [behind, *(lane.centre for lane in lanes), ahead]
+        points = np.concatenate(parts)
         length = float(_arc(points)[-1])
         size = next((n for n in LINE_SIZES if n > length + 1), LINE_SIZES[-1])
         line = reference_line_from_polyline(points, size=size, step=LINE_STEP_M)
         station = np.maximum.accumulate(_project(line, points)[0])
-        left = np.concatenate([lane.left_width for lane in lanes])
-        right = np.concatenate([lane.right_width for lane in lanes])
-        counts = [len(lane.centre) for lane in lanes]
         limits = [lane.speed_limit or self.default_limit for lane in lanes]
-        extra_left = [self._beside(lane, "left") for lane in lanes]
-        extra_right = [self._beside(lane, "right") for lane in lanes]
+        counts = [len(part) for part in parts]
+        limits = np.repeat([limits[0], *limits, limits[-1]], counts)
+        edges = {}
+        for side in ("left", "right"):
+            own = np.concatenate([getattr(x, f"{side}_width") for x in lanes])
+            own = np.pad(own, (counts[0], counts[-1]), mode="edge")
+            extra = [self._beside(lane, side) for lane in lanes]
+            extra = np.repeat([extra[0], *extra, extra[-1]], counts)
+            edges[side] = own, own + extra - self._closed(lanes, side, parts)
+        (left, road_left), (right, road_right) = edges["left"], edges["right"]
         stops = [
             (float(_project(line, lane.stop_line.mean(axis=0)[None])[0][0]), lane)
             for lane in lanes
@@ -195,14 +244,73 @@ class LaneGraph:
             heading=np.unwrap(np.asarray(line.heading, np.float64)),
             kappa=np.asarray(line.kappa, np.float64),
             station=station,
-            speed_limit=np.repeat(limits, counts).astype(np.float64),
+            speed_limit=limits.astype(np.float64),
             lane_left=left,
             lane_right=-right,
-            road_left=left + np.repeat(extra_left, counts),
-            road_right=-right - np.repeat(extra_right, counts),
+            road_left=road_left,
+            road_right=-road_right,
             stop_lines=tuple(stops),
         )
         return self._frames[chain]
+
+    def _beyond(self, lane: Lane, sense: int) -> np.ndarray:
+        """Returns points [k, 2] m along the lane beside one that ends or begins.
+
+        Args:
+          lane: the last of a chain, or the first.
+          sense: 1: beyond its end, -1: before its start.
+        """
+        follows = lane.successors if sense > 0 else self.predecessors[lane.id]
+        found = np.zeros((0, 2))
+        if any(name in self.lanes for name in follows):
+            return found
+        end = lane.centre[::sense][-1]
+        back = int(np.searchsorted(_arc(lane.centre[::-sense]), TURN_M))
+        before = lane.centre[::-sense][min(back, len(lane.centre) - 1)]
+        for beside in (lane.left, lane.right):
+            if beside not in self.lanes:
+                continue
+            names = self.chain(beside, ())
+            line = np.concatenate([self.lanes[name].centre for name in names])[::sense]
+            arc = _arc(line)
+            at = int(np.argmin(np.hypot(*(line - end).T)))
+            s = np.arange(arc[at], min(arc[-1], arc[at] + AHEAD_M), LINE_STEP_M)
+            if len(s) < 3 or len(s) <= len(found):
+                continue
+            place = np.stack([np.interp(s, arc, x) for x in line.T], axis=1)
+            along = np.gradient(place, axis=0)
+            along /= np.maximum(np.hypot(*along.T), 1e-9)[:, None]
+            normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
+            gone, off = s - s[0], float((end - place[0]) @ normal[0])
+            # how the two come nearer over the last metres
+            was = int(np.argmin(np.hypot(*(line - before).T)))
+            turned = np.gradient(line, axis=0)[was] @ [[0.0, 1.0], [-1.0, 0.0]]
+            turned = (before - line[was]) @ turned / max(np.hypot(*turned), 1e-9)
+            slope = float(np.clip((off - turned) / TURN_M, -0.1, 0.1))
+            off = off + slope * TURN_M * (1.0 - np.exp(-gone / TURN_M))
+            # the nearest point may lie a little behind the end
+            found = (place + off[:, None] * normal)[2:]
+        return found[::sense]
+
+    def _closed(
+        self, lanes: list[Lane], side: str, parts: list[np.ndarray]
+    ) -> np.ndarray:
+        """Returns m by which the road is narrower on a side, where a lane has ended.
+
+        Args:
+          lanes: of the chain.
+          side: "left" or "right".
+          parts: points of the line before the chain, of its lanes, and beyond.
+        """
+        found = [np.zeros(len(part)) for part in parts]
+        for lane, number in ((lanes[0], 0), (lanes[-1], -1)):
+            if len(parts[number]) and getattr(lane, side) not in self.lanes:
+                end = -1 if number else 0
+                width = lane.left_width[end] + lane.right_width[end]
+                gone = _arc(parts[number] if number else parts[number][::-1])
+                share = np.minimum(gone / CLOSING_M, 1.0)
+                found[number] = width * (share if number else share[::-1])
+        return np.concatenate(found)
 
     def _beside(self, lane: Lane, side: str) -> float:
         """Return width [m] of all same-direction lanes on one side."""
