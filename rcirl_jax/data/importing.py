@@ -517,7 +517,7 @@ class _Import:
         said = ""
         if self.driven_on:
             again = counted(len(self.driven_on), "vehicle")
-            said = f"; {again} met again in the next recording: on one side"
+            said = f"; {again} met again in the next recording: each is in one split"
         if len(self.without_clock) > 1:
             said += "; the logs say no time of day: files of one stream cannot be told"
         return said

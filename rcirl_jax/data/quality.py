@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -53,7 +53,8 @@ class QualityReport:
     rows: Counter = dataclasses.field(default_factory=Counter)
     # tracks joined or left out, by why
     flicker: Counter = dataclasses.field(default_factory=Counter)
-    notes: list[str] = dataclasses.field(default_factory=list)
+    # of each recording's name and the note, what matters most first
+    notes: list[tuple[str, str]] = dataclasses.field(default_factory=list)
     refused: int = 0  # recordings left out
     empty: int = 0  # recordings without traffic
     # lanes without a speed limit or width, road users without a size, and all of them
@@ -63,11 +64,11 @@ class QualityReport:
         """Count and note a recording that is left out, or in which nobody drives."""
         if recording.refused:
             self.refused += 1
-            self.notes.append(f"left out: {recording.refused}")
+            self.notes.append(("left out", recording.refused))
         else:
             self.empty += 1
             notes = ("no traffic", *recording.notes)
-            self.notes += [f"{recording.name}: {note}" for note in notes]
+            self.notes += [(recording.name, note) for note in notes]
 
     def add_recording(self, collector: Collector) -> None:
         """Count a recording's tracks, noise, drop reasons and notes."""
@@ -86,8 +87,6 @@ class QualityReport:
             self.harsh_smooth += smoothed[0]
             self.accelerations += count
         self.flicker.update(collector.flicker)
-        if collector.flicker:
-            self.notes.append(f"{recording.name}: {note_of(collector.flicker)}")
         self.dropped.update(collector.dropped)
         self.shortened += collector.ended["shortened"]
         self.times += collector.ended["times"]
@@ -96,13 +95,16 @@ class QualityReport:
         self.assumed.update(found)
         self.assumed["lanes"] += len(recording.lanes)
         self.assumed["road users"] += len(recording.tracks)
-        words = ", ".join(f"{count} {what}" for what, count in found.items() if count)
-        if words:
-            limit = f"{LIMIT} {recording.default_speed_limit:.2f} m/s"
-            words = words.replace(LIMIT, limit)
-            self.notes.append(f"{recording.name}: assumed: {words}")
+        whose = {
+            LIMIT: f"a speed limit of {recording.default_speed_limit:.2f} m/s",
+            WIDTH: "the width of lanes",
+            SIZE: "the size of road users",
+        }
+        words = ", ".join(whose[what] for what, count in found.items() if count)
         notes = [*recording.notes, *collector.signal_notes]
-        self.notes += [f"{recording.name}: {note}" for note in notes]
+        notes += [note_of(collector.flicker)] if collector.flicker else []
+        notes += [f"assumed where the log does not say it: {words}"] if words else []
+        self.notes += [(recording.name, note) for note in notes]
 
     def add_scenes(self, demonstrations: Demonstration) -> None:
         """Count scenes, tags, decisions, headways, speeds and futures."""
@@ -154,6 +156,7 @@ class QualityReport:
         values, times = _sorted(self.headways, HEADWAY_STEP_S)
         edges = (0.0, *HEADWAY_EDGES_S, np.inf)
         binned = np.histogram(values, edges, weights=times)[0]
+        notes = merged_notes(self.notes)
         is_assumed = any(self.assumed[what] for what in (LIMIT, WIDTH, SIZE))
         return {
             "recordings": self.recordings,
@@ -183,9 +186,32 @@ class QualityReport:
             **({"refused": self.refused} if self.refused else {}),
             **({"empty": self.empty} if self.empty else {}),
             **({"assumed": dict(self.assumed)} if is_assumed else {}),
-            "notes": self.notes[:200],
-            "num_notes": len(self.notes),
+            "notes": notes[:200],
+            "num_notes": len(notes),
         }
+
+
+def merged_notes(notes: Sequence[tuple[str, str]]) -> list[str]:
+    """Returns notes as lines: equal ones of several recordings as one.
+
+    What stands first among the notes of a recording comes first.
+
+    Args:
+      notes: (name of the recording, note), in the order of the recordings.
+    """
+    ranks: dict[str, int] = {}
+    met: Counter = Counter()
+    names: dict[str, list[str]] = {}
+    for name, note in notes:
+        ranks.setdefault(note, met[name])
+        met[name] += 1
+        names.setdefault(note, []).append(name)
+    found = []
+    for note in sorted(names, key=lambda note: ranks[note]):
+        first, *more = dict.fromkeys(names[note])
+        others = f" and {len(more)} more" if more else ""
+        found.append(f"{first}{others}: {note}")
+    return found
 
 
 def assumed(recording: Recording) -> dict[str, int]:
@@ -289,12 +315,16 @@ def oddities(report: Mapping) -> list[str]:
     if report.get("assumed"):
         counts = report["assumed"]
         wholes = (LIMIT, "lanes"), (WIDTH, "lanes"), (SIZE, "road users")
+        # a lane ends where it joins, splits or is cut: these are no whole lanes
+        spoken = {"lanes": "pieces of lanes", "road users": "road users"}
         parts = [
-            f"{what} of {counts[what]:,} of {counts[whole]:,} {whole}"
+            f"{what} of {counts[what]:,} of {counts[whole]:,} {spoken[whole]}"
             for what, whole in wholes
             if counts.get(what)
         ]
-        lines.append(f"assumed, as the log does not say: {', '.join(parts)}")
+        files = report["recordings"]
+        over = f", counted in each of {files:,} recordings" if files > 1 else ""
+        lines.append(f"assumed, as the log does not say: {', '.join(parts)}{over}")
     lines += [f"note: {note}" for note in report["notes"][:NOTES_SHOWN]]
     if report["num_notes"] > NOTES_SHOWN:
         lines.append(f"{report['num_notes']} notes in all: manifest.json")
@@ -309,10 +339,10 @@ def format_splits(dataset: Dataset) -> str:
         count = len(dataset.manifest.splits[split])
         lines.append(
             f"{'split ' + split:<28}{scenes:>10,} scenes "
-            f"({scenes / max(dataset.count, 1):.1%}), groups that share no vehicle: "
-            f"{count:,}"
+            f"({scenes / max(dataset.count, 1):.1%}) in {counted(count, 'group')} of "
+            "vehicles; no vehicle is in both splits"
         )
     if "split_by" in flags:
-        asked = f"asked for {flags['test_fraction']:.1%} to test"
+        asked = f"{flags['test_fraction']:.1%} of the scenes were asked for in test"
         lines.append(f"{'split by':<28}{flags['split_by']}; {asked}")
     return "\n".join(lines)

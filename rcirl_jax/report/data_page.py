@@ -16,7 +16,7 @@ from rcirl_jax.data.plans import facts_of
 from rcirl_jax.data.quality import oddities
 from rcirl_jax.data.scenes.filters import REASONS
 from rcirl_jax.data.store.dataset import Dataset
-from rcirl_jax.errors import MALFORMED, InputError
+from rcirl_jax.errors import MALFORMED, InputError, counted
 from rcirl_jax.report.pages import Table, facts_text, part, write_page
 from rcirl_jax.report.scene import describe_scene, draw_scene, spoken, tag_names
 from rcirl_jax.report.site import site_png
@@ -188,8 +188,10 @@ def _facts(dataset: Dataset) -> Table:
     rows += [(words, "") for words in oddities(quality)]
     for split, groups in manifest.splits.items():
         count = dataset.indices(split).size
-        many = "group" if len(groups) == 1 else "groups that share no vehicle"
-        words = f"{count:,} scenes in {len(groups):,} {many}"
+        words = (
+            f"{count:,} scenes in {counted(len(groups), 'group')} of vehicles; no "
+            "vehicle is in both splits"
+        )
         rows.append((f"split {split}", words))
     if "split_by" in manifest.import_flags:
         rows.append(("split by", manifest.import_flags["split_by"]))

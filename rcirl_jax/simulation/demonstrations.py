@@ -202,7 +202,7 @@ def _drive_all(
                 quality.recordings += 1
                 quality.tracks += 1
                 if not rows:
-                    quality.notes.append(f"{ref.id}: no clean drive: dropped")
+                    quality.notes.append((ref.id, "no clean drive: dropped"))
                     continue
                 same = [number] * len(rows)
                 block = assemble(rows, vehicles=same, groups=same, recording=number)

@@ -139,8 +139,10 @@ def test_one_recording_is_split_by_when_vehicles_are_first_seen(tmp_path, group)
     assert "split by                    blocks of 3.75 s in which" in told
     assert told.index("split train") < told.index("split test")
     scenes = dataset.indices("test").size
-    assert re.search(rf"split test +{scenes} scenes \(.*%\), .*: 1$", told, re.M)
-    assert "asked for 40.0% to test" in told
+    assert re.search(
+        rf"split test +{scenes} scenes \(.*%\) in 1 group of vehicles; .*", told, re.M
+    )
+    assert "40.0% of the scenes were asked for in test" in told
 
 
 def test_an_empty_split_is_refused_and_what_is_finished_stays(tmp_path):

@@ -64,7 +64,7 @@ def with_roads(name: str, read: Read, path: Path, spec: dict) -> Iterator[Record
             roads = _SITES[key].roads_of(made, path).moved(-np.array(made.origin))
         note = f"{wanted.why}; {roads.note}" if wanted.why else roads.note
         made = dataclasses.replace(
-            made, lanes=roads.lanes, open_roads=None, notes=(*made.notes, note)
+            made, lanes=roads.lanes, open_roads=None, notes=(note, *made.notes)
         )
         yield accepted(lambda made=made: made, made.name, path, spec)
 

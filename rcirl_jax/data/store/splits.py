@@ -82,6 +82,9 @@ def assign_groups(
     return {split: sorted(names) for split, names in chosen.items()}
 
 
+WHOLES = "whole recordings, or groups that the log declares; each is in one split"
+
+
 def split_wholes(
     sizes: Mapping[str, int],
     levels: tuple[Mapping[str, str], Mapping[str, str]],
@@ -112,7 +115,7 @@ def split_wholes(
         for split, names in chosen.items()
     }
     words = "minutes in which vehicles are first seen"
-    return splits, words if is_one else "recordings, or groups that a log declares"
+    return splits, words if is_one else WHOLES
 
 
 def time_blocks(

@@ -136,7 +136,7 @@ def test_they_are_counted_and_shown():
     again.merge(report.state())
     assert again.as_dict()["flicker"] == {JOINED: 2, SHORT: 2}
     assert report.notes == [
-        "hand: tracks that flicker: 1 fragments joined, 1 too short"
+        ("hand", "tracks that flicker: 1 fragments joined, 1 too short")
     ]
     assert "1 fragments joined, 1 too short" in format_quality(report.as_dict())
     assert report.as_dict()["tracks"] == 2

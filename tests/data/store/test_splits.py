@@ -4,6 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rcirl_jax.data.store.splits import (
+    WHOLES,
     assign_groups,
     check_disjoint,
     split_wholes,
@@ -109,7 +110,7 @@ def test_recordings_are_split_whole_and_one_by_its_groups():
     levels = {name: name[:2] for name in sizes}, {name: name for name in sizes}
     split, words = split_wholes(sizes, levels, test_fraction=0.25, seed=0)
     assert split["test"] == ["r2/minute-0000"]
-    assert words == "recordings, or groups that a log declares"
+    assert words == WHOLES
     del sizes["r2/minute-0000"]
     split, words = split_wholes(sizes, levels, test_fraction=0.25, seed=0)
     assert split == {"train": ["r1/minute-0000"], "test": ["r1/minute-0001"]}
