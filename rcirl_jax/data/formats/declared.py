@@ -4,7 +4,7 @@ A format states its columns as field -> kind of cells (`tables.table.LIMITS`); w
 odd about it is a short hook of its reader.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +38,16 @@ def with_numbers_and_texts(spec: dict, packaged: Mapping) -> dict:
     return {k: v for k, v in packaged.items() if isinstance(v, plain)} | spec
 
 
-def open_log(path: Path, spec: Mapping) -> tuple[Table, RowStats]:
-    """Opens a table as its source TOML says, and counts of its rows."""
-    known = [*section(spec, "columns").values(), *section(spec, "kinds")]
-    known = [name for name in known if isinstance(name, str)]
+def open_log(
+    path: Path, spec: Mapping, known: Collection[str] = ()
+) -> tuple[Table, RowStats]:
+    """Opens a table as its source TOML says, and counts of its rows.
+
+    Args:
+      path: file.
+      spec: source TOML.
+      known: names that the table should hold, which may tell its encoding.
+    """
     table = open_table(path, section(spec, "table"), known)
     return table, RowStats(path=path, unit=table.unit, allowed=allowed_share(spec))
 

@@ -142,7 +142,9 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
 
 def opened(file: Path, spec: dict) -> Log:
     """Opens a file with its columns; none of its rows is read."""
-    table, stats = open_log(file, spec)
+    names = [*section(spec, "columns").values(), *section(spec, "kinds")]
+    known = [name for name in names if isinstance(name, str)]
+    table, stats = open_log(file, spec, known)
     return Log(table=table, spec=spec, columns=columns_of(table, spec), stats=stats)
 
 
