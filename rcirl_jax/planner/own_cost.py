@@ -178,7 +178,7 @@ class Processes:
         flat = jax.tree.map(
             lambda x: np.ascontiguousarray(x.reshape(-1, *x.shape[len(lead) :])), given
         )
-        plain = {name: _plain(tree) for name, tree in flat.items()}
+        plain = _named(flat)
         with self._lock:
             process = self._idle.pop() if self._idle else None
         process = process or self._started()
@@ -193,17 +193,19 @@ class Processes:
     def _started(self) -> AnsweringProcess:
         program = [sys.executable, "-m", "rcirl_jax.planner.own_cost_process"]
         process = AnsweringProcess([*program, self._place])
-        self._asked(process, None, START_S)
+        self._asked(process, {}, START_S)
         return process
 
-    def _asked(self, process: AnsweringProcess, given: object, limit: float) -> Any:  # noqa: ANN401
+    def _asked(
+        self, process: AnsweringProcess, given: dict[str, np.ndarray], limit: float
+    ) -> np.ndarray:
         try:
-            kind, made = process.ask(given, limit)
+            made = process.ask(given, limit)
         except NoAnswer as error:
             self._fails(str(error))
-        if kind != "costs":
-            self._fails(made)
-        return made
+        if "wrong" in made:
+            self._fails(str(made["wrong"]))
+        return made["costs"]
 
     def _fails(self, why: str) -> NoReturn:
         line = str(InputError(f"{self._place}: {why}: {EXPECTED}"))
@@ -220,12 +222,14 @@ def _processes(cost: OwnCost) -> Processes:
         return _processes_of.setdefault(cost, Processes(cost.place))
 
 
-def _plain(tree: Any) -> Any:  # noqa: ANN401
-    """Nodes as dicts, so that a process need not know the package's types."""
+def _named(tree: Any, name: str = "") -> dict[str, np.ndarray]:  # noqa: ANN401
+    """Arrays by their places, "scene.ego.v": a process need not know our types."""
     if dataclasses.is_dataclass(tree):
-        names = [field.name for field in dataclasses.fields(tree)]
-        return {name: _plain(getattr(tree, name)) for name in names}
-    return tree
+        tree = {x.name: getattr(tree, x.name) for x in dataclasses.fields(tree)}
+    if not isinstance(tree, dict):
+        return {name[1:]: tree}
+    parts = [_named(part, f"{name}.{key}") for key, part in tree.items()]
+    return {key: array for part in parts for key, array in part.items()}
 
 
 def check_own_cost(

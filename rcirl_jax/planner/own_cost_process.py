@@ -2,22 +2,23 @@
 
     python -m rcirl_jax.planner.own_cost_process costs.py:my_cost
 
-Reads pickled batches from standard input, each after its length, and writes
-("costs", [n, K]) or ("wrong", a line) likewise. Knows nothing of JAX, so that it starts
-at once. What the cost prints goes to standard error.
+Reads batches as named arrays from standard input (`runtime.answering`), and writes
+costs [n, K], or a line on what is wrong. Knows nothing of JAX, so that it starts at
+once. What the cost prints goes to standard error.
 """
 
 import ctypes
 import importlib.util
 import os
-import pickle
 import struct
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+
+from rcirl_jax.runtime.answering import packed, unpacked
 
 ABI = 1  # RCIRL_COST_ABI
 TIMES_S = np.linspace(0.0, 8.0, 18, dtype=np.float32)
@@ -127,11 +128,18 @@ def python_cost(place: str) -> Callable[[Any, Any], np.ndarray]:
     return getattr(module, name)
 
 
-def _node(tree: Any, number: int) -> Any:  # noqa: ANN401
-    """One of a batch, with attributes instead of keys."""
-    if isinstance(tree, dict):
-        return types.SimpleNamespace(**{k: _node(x, number) for k, x in tree.items()})
-    return tree[number]
+def _node(arrays: Mapping[str, np.ndarray], number: int) -> types.SimpleNamespace:
+    """One of a batch, with attributes for the parts of names."""
+    root = types.SimpleNamespace()
+    for name, array in arrays.items():
+        *path, last = name.split(".")
+        at = root
+        for part in path:
+            if not hasattr(at, part):
+                setattr(at, part, types.SimpleNamespace())
+            at = getattr(at, part)
+        setattr(at, last, array[number])
+    return root
 
 
 def main() -> None:
@@ -140,21 +148,18 @@ def main() -> None:
     os.dup2(2, 1)
     cost: Callable[[Any, Any], np.ndarray] | None = None
     while head := sys.stdin.buffer.read(8):
-        given = pickle.loads(sys.stdin.buffer.read(*struct.unpack("<Q", head)))
+        given = unpacked(sys.stdin.buffer.read(*struct.unpack("<Q", head)))
         try:
             if cost is None:
                 is_library = place.endswith(".so")
                 cost = library_cost(place) if is_library else python_cost(place)
-            made: tuple = ("costs", None)
-            if given is not None:
-                scene, candidates = given["scene"], given["candidates"]
-                count = len(candidates["feasible"])
-                pairs = [(_node(scene, i), _node(candidates, i)) for i in range(count)]
-                made = "costs", np.stack([np.asarray(cost(*x), float) for x in pairs])
+            count = len(given["candidates.feasible"]) if given else 0
+            each = [_node(given, number) for number in range(count)]
+            costs = [np.asarray(cost(x.scene, x.candidates), float) for x in each]
+            made = {"costs": np.stack(costs) if costs else np.zeros(0)}
         except Exception as error:
-            made = "wrong", f"{type(error).__name__}: {error}"
-        text = pickle.dumps(made, protocol=5)
-        answers.write(struct.pack("<Q", len(text)) + text)
+            made = {"wrong": np.array(f"{type(error).__name__}: {error}")}
+        answers.write(packed(made))
         answers.flush()
 
 
