@@ -14,6 +14,7 @@ import dataclasses
 import functools
 import hashlib
 import importlib.util
+import logging
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -39,6 +40,8 @@ NOT_TRACEABLE = (
 EXPECTED = "expected costs [K] of (scene, candidates), lower is better"
 
 _failed: dict[str, str] = {}  # place -> line on why its process gave no costs
+# JAX prints the traceback of a callback that fails; the line says it
+logging.getLogger("jax._src.callback").addFilter(lambda record: not _failed)
 
 
 def is_place(name: str) -> bool:

@@ -29,7 +29,7 @@ REQUIRED = {
     "train": "data, --output",
     "sweep": "data, --output",
     "rank": "weights, --data",
-    "simulate": "weights, --output",
+    "simulate": "output",
     "gate": "candidate, --output",
     "replay": "weights, --case, --output",
     "report": "run",
