@@ -20,8 +20,8 @@ def write(tmp_path, text):
     return str(path)
 
 
-def test_the_three_recipes_say_what_decides_a_run():
-    assert recipe_names() == ["paper", "quick", "tuned"]
+def test_the_recipes_say_what_decides_a_run():
+    assert recipe_names() == ["paper", "quick", "residual", "tuned"]
     needed = {"loss", "positive", "futures", "admissible_in", "epochs", "learning_rate"}
     for name in recipe_names():
         body = load_toml(spec_root() / "recipes" / f"{name}.toml")
@@ -45,6 +45,14 @@ def test_the_papers_own_setting():
 @pytest.mark.parametrize(
     ("text", "says"),
     [
+        (
+            "[train]\npositive = 'nearest'\nresidual_on = 'mine'",
+            r"residual_on: mine: expected \"own cost\", the incumbent's",
+        ),
+        (
+            "[train]\npositive = 'nearest'\nresidual_on = 'own cost'",
+            r"residual_on: own cost: expected no \[prior_cost\], and",
+        ),
         ("[train]\nlos = 'rank'", r"los: unknown: .*did you mean loss\?"),
         ("[train]\nepochs = 'many'", r"epochs: many: expected a whole number"),
         (
