@@ -143,7 +143,7 @@ def sentence(pair: Pair, verdict: Verdict) -> str:
         names = {c.name for c in better}
         label = "Not told apart"
         undecided = [title for title, any_of in MAIN.items() if not names & any_of]
-        rest = ["nothing ships on a part"]
+        rest = ["Nothing ships on a part"]
     accepted = ", ".join(x.case for x in verdict.new_faults if x.accepted)
     said = ""
     for details, crawling in DETAILS:

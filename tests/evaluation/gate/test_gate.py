@@ -245,7 +245,7 @@ def test_a_part_of_the_suite_says_what_it_did_show():
     assert re.fullmatch(r"Better: progress \+10\.0 % \[\+9\.\d+, .*\]", better)
     assert apart.startswith("Not told apart: ")
     assert "progress" not in apart
-    assert rest == "nothing ships on a part"
+    assert rest == "Nothing ships on a part"
     assert then == "Next: drive what was left out"
     same = judge(
         part_of(pair(base, base), slice(None, None, 5)), GateConfig(), part="a part"
