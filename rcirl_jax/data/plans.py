@@ -96,7 +96,9 @@ def changes_of_lane(track: Track, graph: LaneGraph) -> list[list[float]]:
 
 def _points(track: Track) -> list[list[float]]:
     """Returns x, y, heading, speed every STEP_S."""
-    rows = np.searchsorted(track.t, np.arange(track.t[0], track.t[-1], STEP_S))
+    times = np.arange(track.t[0], track.t[-1], STEP_S)
+    # the last may lie a rounding behind the end
+    rows = np.searchsorted(track.t, np.minimum(times, track.t[-1]))
     columns = (track.x, track.y, track.heading, track.speed)
     return np.stack(columns, axis=1)[rows].round(2).tolist()
 

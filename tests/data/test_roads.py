@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
+from rcirl_jax.data import plans
 from rcirl_jax.data.plans import changes_of_lane
 from rcirl_jax.data.roads import roads_from_tracks
 from rcirl_jax.data.scenes.lanes import LaneGraph, project
-from rcirl_jax.types import Recording
+from rcirl_jax.types import Kind, Recording, Track
 from tests.data.formats.fixtures.drives import straight
 from tests.helpers.driven_roads import country_road, crossing, highway, motorway
 
@@ -262,3 +263,13 @@ def test_lanes_of_opposite_directions_and_of_a_second_lane():
     parked, noise = straight(t, (5.0, 5.0), 0.0, 0.0), np.random.default_rng(1)
     parked = dataclasses.replace(parked, x=5.0 + noise.normal(size=t.size))
     assert roads_from_tracks([parked]).lanes == ()
+
+
+@pytest.mark.parametrize(("begin", "moments"), [(15.6, 96), (63.9, 96), (0.0, 1)])
+def test_a_track_whose_end_rounds_below_a_step_is_drawn_to_its_end(begin, moments):
+    t = np.round(begin + 0.1 * np.arange(moments), 6)
+    ways = {"x": 10.0 * t, "y": 0.0 * t, "heading": 0.0 * t, "speed": 0.0 * t + 10.0}
+    sizes = {"kind": Kind.VEHICLE, "length": 4.5, "width": 1.8}
+    points = plans._points(Track(id="a", t=t, **ways, **sizes))
+    assert all(10.0 * begin <= point[0] <= 10.0 * t[-1] + 0.01 for point in points)
+    assert len(points) >= (moments - 1) // 5
