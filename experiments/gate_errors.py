@@ -1,4 +1,4 @@
-"""How often is the gate wrong? Its verdicts on drivers whose truth is known.
+"""Counts wrong verdicts of the gate, on drivers whose truth is known.
 
     python -m experiments.gate_errors --output=out/gate_errors.json
 

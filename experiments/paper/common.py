@@ -1,4 +1,4 @@
-"""What the paper's experiments share: flags, data, training, files."""
+"""The common part of the paper's experiments: flags, data, training, files."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -103,7 +103,7 @@ def epochs() -> int:
 
 
 def positive() -> str:
-    """What is ranked first."""
+    """Returns the kind of positive."""
     return POSITIVE.value or recipe().train.positive
 
 

@@ -266,7 +266,7 @@ def column(found: Mapping[str, ArrayLike], cluster: np.ndarray) -> Column:
 
 
 def driven(files: Mapping[str, str], cases: int, duration: float) -> dict[str, Column]:
-    """What the cases say of every run and of the baselines.
+    """Drives the cases with every run and the baselines.
 
     Args:
       files: of `written`.

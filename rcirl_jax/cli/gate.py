@@ -23,7 +23,13 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.gate.types import DRIVES
 from rcirl_jax.evaluation.gate.verdict import write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
-from rcirl_jax.export.closed_loop import gate_job, judged, read_tuned_idm
+from rcirl_jax.export.closed_loop import (
+    checked_own_cost,
+    gate_job,
+    judged,
+    read_tuned_idm,
+)
+from rcirl_jax.planner import own_cost
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.simulation.rows import BASELINES
 
@@ -81,6 +87,8 @@ def main() -> None:
         tuned_idm=read_tuned_idm(Path(_IDM.value)) if _IDM.value else None,
         track=_FILTER.value,
     )
+    if job.own:
+        print(own_cost.words(checked_own_cost(job.own)))
     if said := shared.idm_left_out(_IDM.value):
         print(said)
     sources = [open_dataset(url) for url in _DATA.value]

@@ -13,7 +13,6 @@ is called back.
 import dataclasses
 import functools
 import hashlib
-import importlib.util
 import logging
 import sys
 import threading
@@ -26,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError, did_you_mean
+from rcirl_jax.planner.own_cost_process import python_cost
 from rcirl_jax.runtime.answering import AnsweringProcess, NoAnswer
 from rcirl_jax.types import Candidates, Scene
 
@@ -64,20 +64,20 @@ class OwnCost:
         return function if function else Path(file).stem.removeprefix("lib")
 
     @property
-    def form(self) -> str:
-        """How it is computed: "JAX", or "called back"; known once it was traced."""
-        return _form.get(self, "C" if self.place.endswith(".so") else "JAX")
+    def is_called_back(self) -> bool:
+        """True if JAX cannot trace it: of a library, or found out while tracing."""
+        return self.place.endswith(".so") or self in _called_back
 
     def score(self, params: None, scene: Scene, candidates: Candidates) -> jax.Array:
         """Minus the cost [K], as `planner.rank.Score`."""
         del params
-        if self.place.endswith(".so") or self.form != "JAX":
-            return -self._called_back(scene, candidates)
+        if self.is_called_back:
+            return -self._asked(scene, candidates)
         try:
             costs = _function(self)(scene, candidates)
         except NOT_TRACEABLE:
-            _form[self] = "called back"
-            return -self._called_back(scene, candidates)
+            _called_back.add(self)
+            return -self._asked(scene, candidates)
         except Exception as error:
             raise InputError(
                 f"{self.place}: {type(error).__name__}: {error}: {EXPECTED}"
@@ -90,7 +90,7 @@ class OwnCost:
             )
         return -jnp.asarray(costs, jnp.float32)
 
-    def _called_back(self, scene: Scene, candidates: Candidates) -> jax.Array:
+    def _asked(self, scene: Scene, candidates: Candidates) -> jax.Array:
         shape = jax.ShapeDtypeStruct(candidates.feasible.shape, jnp.float32)
         given = {"scene": scene, "candidates": candidates}
 
@@ -100,7 +100,7 @@ class OwnCost:
         return jax.pure_callback(costs, shape, given, vmap_method="broadcast_all")
 
 
-_form: dict[OwnCost, str] = {}
+_called_back: set[OwnCost] = set()  # functions that JAX has failed to trace
 
 
 @functools.cache
@@ -131,27 +131,27 @@ def own_cost(place: str) -> OwnCost:
 @functools.cache
 def _function(cost: OwnCost) -> Callable[[Scene, Candidates], Any]:
     """Loads the function of a Python file."""
-    stem, _, name = cost.place.partition(".py:")
-    spec = importlib.util.spec_from_file_location(
-        f"own_cost_{cost.sha256[:8]}", stem + ".py"
-    )
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
     try:
-        spec.loader.exec_module(module)
+        return python_cost(cost.place)
     except Exception as error:
+        if isinstance(error, AttributeError) and error.name == cost.name:
+            known = [name for name in dir(error.obj) if not name.startswith("_")]
+            raise InputError(
+                f"{cost.place}: expected a function of that file"
+                + did_you_mean(cost.name, known)
+            ) from error
         raise InputError(
-            f"{stem}.py: {type(error).__name__}: {error}: expected a file that Python "
-            "can import"
+            f"{cost.place}: {type(error).__name__}: {error}: expected a file that "
+            "Python can import"
         ) from error
-    functions = [n for n, x in vars(module).items() if callable(x)]
-    if name not in functions:
-        raise InputError(
-            f"{stem}.py: {name}: expected a function of that file"
-            + did_you_mean(name, functions)
-        )
-    return getattr(module, name)
+
+
+def words(cost: OwnCost) -> str:
+    """Says how an own cost is computed."""
+    how = "a function of JAX"
+    if cost.is_called_back:
+        how = f"called back in processes of its own, which is slower than {how}"
+    return f"own cost {cost.name}: {how}"
 
 
 def failure(error: BaseException) -> str | None:
@@ -222,7 +222,9 @@ _making = threading.Lock()
 
 def _processes(cost: OwnCost) -> Processes:
     with _making:
-        return _processes_of.setdefault(cost, Processes(cost.place))
+        if cost not in _processes_of:
+            _processes_of[cost] = Processes(cost.place)
+        return _processes_of[cost]
 
 
 def _named(tree: Any, name: str = "") -> dict[str, np.ndarray]:  # noqa: ANN401

@@ -19,10 +19,9 @@ from typing import Any
 import numpy as np
 
 from rcirl_jax.runtime.answering import packed, unpacked
+from rcirl_jax.units import STATION_STEP_M, TIMES_S
 
 ABI = 1  # RCIRL_COST_ABI
-TIMES_S = np.linspace(0.0, 8.0, 18, dtype=np.float32)
-STATION_STEP_M = 2.0
 _FLOATS, _INTS = ctypes.POINTER(ctypes.c_float), ctypes.POINTER(ctypes.c_int32)
 _BYTES = ctypes.POINTER(ctypes.c_uint8)
 EGO = ("s", "l", "dl", "ddl", "v", "a", "length", "width")

@@ -29,13 +29,13 @@ import functools
 import hashlib
 import json
 import os
+import pathlib
 import shlex
 import shutil
 import sys
 import threading
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any
 
 import jax
@@ -48,7 +48,7 @@ from rcirl_jax.planner.plan import Plan, plan_of
 from rcirl_jax.runtime.answering import AnsweringProcess, NoAnswer
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.sampling import trajectory_on_path
-from rcirl_jax.types import Scene
+from rcirl_jax.types import Ego, Obstacles, Path, Scene
 from rcirl_jax.units import NUM_TIMES, STATION_STEP_M, TIMES_S, Kind
 
 PROTOCOL = 1
@@ -62,12 +62,9 @@ BACK_M = 1e-3  # m of rounding by which a station may be behind the one before
 SHOWN = 80  # characters of an answer in a line on it
 NO_CASE = 2**32 - 1  # number of a scene that is of no case
 EXPECTED = 'expected {"s": [18 stations, m]}'
-EGO = ("s", "l", "dl", "ddl", "v", "a", "length", "width")
-PATH = (
-    *("kappa", "l", "speed_limit", "lane_left", "lane_right"),
-    *("road_left", "road_right"),
-)
-BOXES = ("s_lower", "s_upper", "l_lower", "l_upper", "speed", "valid")
+EGO, ROAD = tuple(Ego.__dataclass_fields__), tuple(Path.__dataclass_fields__)
+AT_START = ("kind", "a", "l_dot")  # of an obstacle; all else is at the times
+BOXES = tuple(x for x in Obstacles.__dataclass_fields__ if x not in AT_START)
 
 
 class _Hello(msgspec.Struct):
@@ -121,7 +118,7 @@ def program(place: str) -> Program:
         raise InputError(f"planner: {command!r}: expected a command")
     total = hashlib.sha256(command.encode())
     for word in words:
-        file = Path(shutil.which(word) or word)
+        file = pathlib.Path(shutil.which(word) or word)
         with contextlib.suppress(OSError):
             if file.is_file():
                 total.update(file.read_bytes())
@@ -194,7 +191,7 @@ def scene_line(scene: Scene, case: str | int | None, step: int) -> bytes:
     ]
     sent = {
         "ego": {name: float(getattr(scene.ego, name)) for name in EGO},
-        "path": {name: getattr(scene.path, name).tolist() for name in PATH},
+        "path": {name: getattr(scene.path, name).tolist() for name in ROAD},
         "obstacles": others,
     }
     return msgspec.json.encode({"scene": sent, "case": case, "step": step})

@@ -115,7 +115,7 @@ class Reason(enum.IntEnum):
 
 
 class Explanation(NamedTuple):
-    """Which rule each candidate breaks first; all [K]."""
+    """The rule that each candidate breaks first; all [K]."""
 
     reason: Array  # int32, `Reason`
     obstacle: Array  # int32, the obstacle's place in the scene; -1: of none
@@ -123,7 +123,7 @@ class Explanation(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """What the filter reads of candidates; all [T, K], so that loops are long."""
+    """The motion of candidates as the filter reads it; all [T, K]: loops are long."""
 
     s: Array  # m
     v: Array  # m/s
@@ -317,7 +317,7 @@ def _touches(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
 
 
 def _crossings(scene: Scene, x: Motion, config: SafetyConfig) -> Array:
-    """Where [N, T, K] the front bumper is past a line that demands a stop.
+    """Finds [N, T, K] the front bumper past a line that demands a stop.
 
     A line that lies behind the front bumper now is none.
     """
@@ -371,7 +371,7 @@ def _rss(scene: Scene, x: Motion, config: SafetyConfig) -> tuple[Array, Array]:
 def _inside_limits(
     scene: Scene, x: Motion, config: SafetyConfig
 ) -> tuple[Array, Array, Array]:
-    """Whether speed, road edges and lateral acceleration hold later on, [T - 1, K]."""
+    """Tests speed, road edges and lateral acceleration later on, [T - 1, K] bool."""
     view = path_view(scene, x.s)
     xp = namespace(x.s, view.l)
     # the lower limit of an interval's two ends holds for all of it

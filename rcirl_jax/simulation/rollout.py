@@ -109,7 +109,7 @@ class RolloutConfig:
 
 
 class Manner(flax.struct.PyTreeNode, kw_only=True):
-    """How the ego follows its commands; all []."""
+    """The manner in which the ego follows its commands; all []."""
 
     follow_log: jax.Array  # bool
     command_delay: jax.Array  # steps
@@ -117,7 +117,7 @@ class Manner(flax.struct.PyTreeNode, kw_only=True):
 
 
 class Now(flax.struct.PyTreeNode, kw_only=True):
-    """What one span hands to the next."""
+    """The state that one span hands to the next."""
 
     worlds: World  # leaves [B, ...]
     waiting: jax.Array  # [B, MAX_DELAY + 1] m/s^2, commands, newest first

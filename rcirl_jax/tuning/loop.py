@@ -21,6 +21,7 @@ from rcirl_jax.evaluation.gate.types import CANDIDATE, Verdict
 from rcirl_jax.evaluation.gate.words import WIDTH
 from rcirl_jax.export.closed_loop import SuiteJob
 from rcirl_jax.export.loading import open_reward, prior_cost_words
+from rcirl_jax.planner import own_cost
 from rcirl_jax.runtime.compiling import compiles
 from rcirl_jax.simulation.suite import suite_refs
 from rcirl_jax.tuning.demonstrations import (
@@ -72,6 +73,8 @@ def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
     job, _ = suite_job(run, tuned=False)
     shares = shares_of(run.config.data_weights, len(given))
     _check_incumbent(run)
+    if run.own_cost:
+        run.say(own_cost.words(run.own_cost))
     names, made = STAGES[: STAGES.index(last) + 1], Made()
     with compiles() as compiled:
         clock = Clock(run, names, compiled)

@@ -18,6 +18,16 @@ def run(*command, **options):
     return done.stdout
 
 
+def compiled(source, file, *flags):
+    """A file compiled of one source without warnings, or a skip."""
+    compiler = shutil.which("c++")
+    if compiler is None:
+        pytest.skip("no C++ compiler")
+    strict = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
+    run(compiler, "-std=c++17", "-O1", *strict, *flags, "-o", file, source)
+    return str(file)
+
+
 def configured(folder, *flags):
     """A build folder, or a skip with the reason."""
     compiler = os.environ.get("CXX", "c++")

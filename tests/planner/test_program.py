@@ -1,8 +1,6 @@
 """A planner that is a program: as the built-in one, and what may go wrong with it."""
 
 import json
-import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -33,6 +31,7 @@ from rcirl_jax.simulation.suite import (
     rollout_config,
     suite_refs,
 )
+from tests.onboard.programs import compiled
 
 EXAMPLE = Path(__file__).parents[2] / "onboard" / "example"
 FAULTY = Path(__file__).parent / "programs" / "faulty.py"
@@ -61,15 +60,8 @@ def faulty(*words):
 
 @pytest.fixture(scope="module")
 def in_cpp(tmp_path_factory):
-    compiler = shutil.which("c++")
-    if compiler is None:
-        pytest.skip("no C++ compiler")
     file = tmp_path_factory.mktemp("planner") / "planner_program"
-    warnings = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
-    source = EXAMPLE / "planner_program.cpp"
-    command = [compiler, "-std=c++17", "-O1", *warnings, "-o", str(file), str(source)]
-    subprocess.run(command, check=True)
-    return str(file)
+    return compiled(EXAMPLE / "planner_program.cpp", file)
 
 
 @pytest.fixture(scope="module")

@@ -247,15 +247,9 @@ class FeatureMap:
         self.names = tuple(names)
 
     def __call__(self, scene: Scene, s: Array, l: Array | None = None) -> Array:
-        """F of K candidates in one scene, float32 [K, T, F], as `Reward.value` reads.
+        """Return F of K candidates in one scene, float32 [K, T, F], for `Reward.value`.
 
-        Args:
-          scene: one planning frame.
-          s: [K, T] m, stations at `TIMES_S`.
-          l: [K, T] m, lateral offsets; None: all drive along the given path.
-
-        Raises:
-          FeatureError: a number is missing, not finite or out of range.
+        Arguments and errors are those of `driven`.
         """
         return self.of(driven(scene, s, l))
 

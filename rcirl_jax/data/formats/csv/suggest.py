@@ -235,7 +235,7 @@ def _guess_time_form(table: Table, guess: _Guess) -> None:
 
 
 def _guess_clock_digits(table: Table, guess: _Guess) -> None:
-    """Whether digits are times of day, by the rows of the first MiB."""
+    """Tells by the rows of the first MiB if digits are times of day."""
     name = guess.columns["t"]
     field = Field(name="t", column=name)
     values = next(batches(table, [field], RowStats(table.path, allowed=0.5)))["t"]
