@@ -70,8 +70,7 @@ from rcirl_jax.planner.rank import (
     ranking_score,
 )
 from rcirl_jax.planner.safety import SafetyConfig
-from rcirl_jax.reward import RewardConfig, effective_params, init_params
-from rcirl_jax.reward.normaliser import identity_normaliser
+from rcirl_jax.reward import RewardConfig
 from rcirl_jax.runtime.atomic_files import read_json, write_json
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.runtime.executors import Executor
@@ -84,6 +83,7 @@ from rcirl_jax.simulation.rows import (
     BASELINES,
     Row,
     baseline_row,
+    drawn_weights,
     judges,
     program_row,
     rule_row,
@@ -215,9 +215,7 @@ def _program_of(
     """Preset, weights and activation by whose program baselines are ranked."""
     if reward is not None:
         return str(reward.preset), reward_params(reward), reward.activation
-    shape, count = RewardConfig(), feature_map(NO_WEIGHTS).num_features
-    drawn = effective_params(init_params(jax.random.key(0), count, shape), shape)
-    return NO_WEIGHTS, (drawn, identity_normaliser(count)), shape.activation
+    return NO_WEIGHTS, drawn_weights(NO_WEIGHTS), RewardConfig().activation
 
 
 def _learned_rows(

@@ -36,7 +36,12 @@ from rcirl_jax.planner.rank import (
     ranking,
     ranking_policy,
 )
-from rcirl_jax.reward import RewardConfig, effective_params, init_params
+from rcirl_jax.reward import (
+    RewardConfig,
+    effective_params,
+    identity_normaliser,
+    init_params,
+)
 from rcirl_jax.reward.speed_dp import SPEED_DP_ROW
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.metrics import CaseMetrics
@@ -105,6 +110,20 @@ def human_row() -> Row:
     return rule_row(RECORDED_HUMAN, "constant speed", follow_log=True)
 
 
+def drawn_weights(
+    preset: str, shape: RewardConfig | None = None
+) -> tuple[RewardParams, Normaliser]:
+    """Effective parameters of a reward that knows nothing, and features as they are.
+
+    Args:
+      preset: of the features.
+      shape: of the network; None: the usual one.
+    """
+    shape, count = shape or RewardConfig(), feature_map(preset).num_features
+    drawn = effective_params(init_params(jax.random.key(0), count, shape), shape)
+    return drawn, identity_normaliser(count)
+
+
 def baseline_row(
     name: str,
     preset: str,
@@ -128,10 +147,9 @@ def baseline_row(
     if name in RULES:
         return rule_row(name, name)
     if name == "random weights":
-        shape = RewardConfig()
-        count = feature_map(preset).num_features
-        drawn = effective_params(init_params(jax.random.key(0), count, shape), shape)
-        return learned_row(name, (drawn, weights[1]), preset, shape.activation, config)
+        drawn, _ = drawn_weights(preset)
+        usual = RewardConfig().activation
+        return learned_row(name, (drawn, weights[1]), preset, usual, config)
     row = learned_row(name, weights, preset, activation, config)
     return dataclasses.replace(row, params=ranking(weights, name, (0.0, 0.0)))
 

@@ -16,8 +16,6 @@ import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import jax
-
 from rcirl_jax.data.formats.files import listing
 from rcirl_jax.data.importing import Logs, import_logs
 from rcirl_jax.data.inputs import input_files
@@ -29,13 +27,11 @@ from rcirl_jax.data.store.dataset import (
 )
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import checked_own_cost, table_rows
-from rcirl_jax.features import feature_map
 from rcirl_jax.planner.own_cost import is_place
 from rcirl_jax.planner.rank import Params, Policy, RankConfig
-from rcirl_jax.reward import effective_params, identity_normaliser, init_params
 from rcirl_jax.runtime.pipeline import digest, file_sha256
 from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
-from rcirl_jax.simulation.rows import baseline_row
+from rcirl_jax.simulation.rows import baseline_row, drawn_weights
 from rcirl_jax.simulation.suite import suite_refs
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.tuning.prior_cost import fit_prior_cost
@@ -171,16 +167,12 @@ def expert_of(
         return None
     if plan.expert == "own cost" or incumbent == "hand-set" or is_place(incumbent):
         own = checked_own_cost(incumbent) if is_place(incumbent) else None
-        shape, features = config.reward, feature_map(config.features)
-        count = features.num_features
-        drawn = effective_params(init_params(jax.random.key(0), count, shape), shape)
-        unused = drawn, identity_normaliser(count)
         row = baseline_row(
             own.name if own else "hand-set",
             config.features,
-            unused,
+            drawn_weights(config.features, config.reward),
             RankConfig(own=own),
-            shape.activation,
+            config.reward.activation,
         )
     else:
         row = table_rows([incumbent], ())[0]
