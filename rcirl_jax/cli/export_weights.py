@@ -4,6 +4,7 @@
     rcirl export --weights=FILE --onnx=FILE --stablehlo=FILE
     rcirl export --weights=LINEAR --yaml=FILE
     rcirl export --run=RUN --stablehlo=FILE
+    rcirl export --weights=FILE --dial=0.5 --output=FILE
 
 The file carries verification samples from the dataset's training split; a reader
 recomputes them before it accepts the file. It also records the range of each feature in
@@ -13,6 +14,9 @@ Other forms are for planners that read neither it nor Python (--onnx and --jax_e
 need the extra [export]). Each scores as the file does, and FILE.json beside it says
 which weights it is of, what trained them and what wrote it. A run with --module has no
 weights.msgpack: --stablehlo and --jax_export write its scorer.
+
+--dial multiplies the gain of the learned value on top of the planner's own cost; `rcirl
+gate` judges that file.
 """
 
 from collections.abc import Mapping
@@ -35,9 +39,13 @@ from rcirl_jax.export.forms import (
 from rcirl_jax.export.from_run import datasets_of, export_run, tags_of
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import Reward
+from rcirl_jax.export.weights import save_with_dial
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
 
-USUAL = ("run", "weights", "output", "data", "onnx", "stablehlo", "jax_export", "yaml")
+USUAL = (
+    *("run", "weights", "output", "dial", "data", "onnx", "stablehlo", "jax_export"),
+    "yaml",
+)
 _RUN = flags.DEFINE_string("run", None, "run to export: a folder of `rcirl train`")
 _WEIGHTS = flags.DEFINE_string(
     "weights", None, "instead: a weights file, to write in other forms"
@@ -47,6 +55,12 @@ _DATA = flags.DEFINE_list(
 )
 _OUTPUT = flags.DEFINE_string(
     "output", None, "weights file to write (default: RUN/weights.msgpack)"
+)
+_DIAL = flags.DEFINE_float(
+    "dial",
+    None,
+    "with --weights and --output: number that multiplies the gain of the learned value "
+    "on top of the own cost; 1 is the file as it is",
 )
 _ONNX = flags.DEFINE_string(
     "onnx", None, "file to write: an ONNX model, for onnxruntime and the like"
@@ -70,7 +84,12 @@ def main() -> None:
     if bool(_RUN.value) == bool(_WEIGHTS.value):
         raise InputError("--run, --weights: expected one of them")
     files = {x.name: Path(x.value) for x in (_STABLEHLO, _JAX, _ONNX, _YAML) if x.value}
-    if _WEIGHTS.value:
+    if _DIAL.value is not None:
+        if not _WEIGHTS.value or not _OUTPUT.value or files:
+            raise InputError("--dial: expected --weights and --output with it, no more")
+        made = save_with_dial(_WEIGHTS.value, _DIAL.value, _OUTPUT.value)
+        print(f"{_OUTPUT.value}: {made.prior_cost}, sha256 {made.sha256[:16]}...")
+    elif _WEIGHTS.value:
         _convert(open_reward(_WEIGHTS.value), files)
     elif _ONNX.value or _YAML.value:
         raise InputError("--onnx, --yaml: expected --weights with them")

@@ -12,6 +12,7 @@ so a file that would be refused is never written.
 import base64
 import dataclasses
 import hashlib
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -83,6 +84,49 @@ def save(
         message = f"{target}: path: {error.strerror}: expected a writable file"
         raise InputError(message) from error
     return reward
+
+
+def save_with_dial(
+    source: str | os.PathLike[str], dial: float, target: str | os.PathLike[str]
+) -> reader.Reward:
+    """Write a weights file again, with the gains on top of its own cost multiplied.
+
+    Args:
+      source: weights file with a prior cost.
+      dial: > 0, by which both ends of the gain are multiplied.
+      target: file to write.
+
+    Returns:
+      The reward as a reader of the new file sees it; its provenance names the old one.
+
+    Raises:
+      InputError: no such weights file, one without a prior cost, or another dial.
+    """
+    try:
+        reward = reader.load_weights(source)
+    except reader.WeightsError as error:
+        raise InputError(str(error)) from error
+    prior = reward.prior_cost
+    if prior is None:
+        raise InputError(
+            f"{source}: prior_cost: none: expected weights on top of an own cost, "
+            "whose gain is multiplied"
+        )
+    if not 0.0 < dial < math.inf:
+        raise InputError(
+            f"dial: {dial:g}: expected above 0; at 0 the own cost drives alone"
+        )
+    body = msgpack.unpackb(msgpack.unpackb(Path(source).read_bytes())["body"])
+    samples = [
+        np.frombuffer(body["samples"][name]["data"], "<f4").reshape(
+            body["samples"][name]["shape"]
+        )
+        for name in ("features", "valid", "value")
+    ]
+    turned = dataclasses.replace(prior, low=dial * prior.low, high=dial * prior.high)
+    facts = {**reward.provenance, "dial": {"of_sha256": reward.sha256, "times": dial}}
+    made = dataclasses.replace(reward, prior_cost=turned, provenance=facts)
+    return save(target, made, *samples)
 
 
 def to_json(data: bytes) -> dict[str, Any]:

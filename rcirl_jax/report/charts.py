@@ -7,7 +7,7 @@ never colour alone.
 """
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
+from rcirl_jax.evaluation.closed_loop.dial import MEASURES
 from rcirl_jax.evaluation.closed_loop.summary import SHORT, SuiteReport
 from rcirl_jax.evaluation.ranking.report import BASELINE_ROWS, RankingReport
 from rcirl_jax.report.pages import number, part
@@ -202,6 +203,30 @@ def curves_panel(axis: Axes, x: ArrayLike, curves: Mapping[str, np.ndarray]) -> 
                 at, mean - error, mean + error, color=colour, alpha=0.18, lw=0
             )
     axis.legend(fontsize=8, frameon=False)
+
+
+def dial_picture(settings: Sequence[Mapping]) -> Markup:
+    """Draw each measure's difference to the own cost alone, with its interval.
+
+    Args:
+      settings: of a run's dial.json.
+    """
+    made, axes = figure(len(MEASURES) // 2, 2, 6.4, 6.6)
+    at = np.arange(len(settings))
+    for axis, (name, how) in zip(axes.ravel(), MEASURES.items(), strict=True):
+        apart = [one["measures"][name]["minus_own"] for one in settings]
+        mean, low, high = (
+            np.array([x[end] for x in apart], float) for end in ("mean", "low", "high")
+        )
+        axis.axhline(0.0, color=BASELINE, lw=1.0, dashes=(3, 3))
+        axis.vlines(at, low, high, color="#000000", lw=2.0)
+        axis.plot(at, mean, "o-", color="#000000", lw=1.0, ms=5)
+        axis.set_xticks(at, [f"{one['dial']:g}" for one in settings])
+        if not np.any(low) and not np.any(high):  # the same in every case
+            axis.set_ylim(-1.0, 1.0)
+        better = "↑" if how.better == "higher" else "↓"
+        label(axis, f"{how.title} {better}", "dial", how.unit)
+    return svg(made, "dial")
 
 
 def sweep_picture(path: Path, report: Mapping) -> Path:

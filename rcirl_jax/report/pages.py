@@ -36,6 +36,8 @@ TERMS = {
     "baseline": "a driver or a score that learned nothing from these recordings",
     "trivial baseline": "a score that knows nothing: any other should beat it",
     "prior cost": "the planner's own cost, to which the learned value is added",
+    "dial": "one number that multiplies the gain of the learned value: at 0 the own "
+    "cost drives alone, at 1 the candidate",
     "familiarity": "how much a scene is like those recorded: the less, the smaller the "
     "part of the learned value",
     "simulated demonstrations": "drives of the own cost in the simulator, which the "

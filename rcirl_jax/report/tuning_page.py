@@ -1,6 +1,7 @@
 """The report of a tuning run: one HTML file that needs no other, verdict first."""
 
 import dataclasses
+import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ import tqdm
 
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.store.dataset import Dataset, Demonstrations
+from rcirl_jax.evaluation.closed_loop.dial import MEASURES
 from rcirl_jax.evaluation.closed_loop.summary import (
     PAPER,
     SHORT,
@@ -32,7 +34,13 @@ from rcirl_jax.evaluation.ranking.report import (
 from rcirl_jax.evaluation.statistics import CONFIDENCE
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.sweep import table as sweep_table
-from rcirl_jax.report.charts import forest_axis, forest_cell, sweep_picture, time_curves
+from rcirl_jax.report.charts import (
+    dial_picture,
+    forest_axis,
+    forest_cell,
+    sweep_picture,
+    time_curves,
+)
 from rcirl_jax.report.features import features_view
 from rcirl_jax.report.frames import draw_frames, draw_training
 from rcirl_jax.report.pages import (
@@ -55,6 +63,7 @@ CONTENTS = (
     ("verdict", "Verdict"),
     ("cases", "Cases"),
     ("likeness", "Nearer to the human"),
+    ("dial", "How strongly the learned value counts"),
     ("checks", "What was tested"),
     ("families", "Families of cases"),
     ("suite", "Closed loop: the paper's table"),
@@ -97,6 +106,7 @@ class TuningReport:
     replays: Sequence[Replay]
     workdir: Path | None  # run whose training curve is drawn
     sweep: Mapping | None  # contents of sweep.json
+    dial: Mapping | None  # contents of dial.json
     likeness: str  # table of held-out drives; "" without
     training_runs: int  # of which the candidate is the median one
     # provenance: flags, commit, versions, hashes by stage
@@ -119,7 +129,8 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
     quality = ""
     if isinstance(report.dataset, Dataset):
         quality = format_quality(report.dataset.manifest.quality)
-    shown = [entry for entry in CONTENTS if workdir or entry[0] != "training"]
+    without = {"training": not workdir, "dial": not report.dial}
+    shown = [entry for entry in CONTENTS if not without.get(entry[0])]
     margins = [
         (name.replace("_", " "), f"{100.0 * value:g} %")
         for name, value in report.gate.margins.items()
@@ -129,6 +140,7 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
         "cards": lambda: cards(verdict, suite, report.incumbent),
         "cases": lambda: case_lines(report.suite, report.incumbent, report.replays),
         "replays": lambda: player_data(report.replays),
+        "dial": lambda: dial_view(report.dial),
         "checks": lambda: checks_tables(verdict),
         "margins": lambda: Table(
             caption="Margins, declared before",
@@ -242,6 +254,52 @@ def _amount(
         "value": values + unit,
         "words": f"{words} {ends}",
         "kind": kind,
+    }
+
+
+def dial_view(dial: Mapping | None) -> dict | None:
+    """Return what each setting of the dial drives like, and differs from setting 0."""
+    if dial is None:
+        return None
+    settings = dial["settings"]
+    heads = [f"{how.title}, {how.unit}" for how in MEASURES.values()]
+
+    def rows(cell: Callable[[Mapping, int], str], some: Sequence[Mapping]) -> list:
+        cells = [
+            [cell(one["measures"][name], how.digits) for name, how in MEASURES.items()]
+            for one in some
+        ]
+        return [(f"{x['dial']:g}", *row) for x, row in zip(some, cells, strict=True)]
+
+    def value(found: Mapping, digits: int) -> str:
+        return interval((found["value"], found["low"], found["high"]), digits)
+
+    def difference(found: Mapping, digits: int) -> str:
+        ends = (
+            math.nan if x is None else x
+            for x in (found["minus_own"][key] for key in ("mean", "low", "high"))
+        )
+        return interval(tuple(ends), digits, signed=True)
+
+    return {
+        **dial,
+        "picture": dial_picture(settings),
+        "files": [one["file"] for one in settings if one["dial"] not in (0.0, 1.0)],
+        "tables": [
+            Table(
+                caption=f"Each setting [{LEVEL}]; setting 1 is the candidate",
+                heads=("dial", *heads),
+                rows=rows(value, settings),
+                marked=["1"],
+            ),
+            Table(
+                caption="Minus the own cost alone, on the same drives "
+                f"[{LEVEL}, each for itself]",
+                heads=("dial", *heads),
+                rows=rows(difference, settings[1:]),
+                marked=["1"],
+            ),
+        ],
     }
 
 

@@ -32,12 +32,14 @@ from rcirl_jax.tuning.demonstrations import (
 )
 from rcirl_jax.tuning.run import Run
 from rcirl_jax.tuning.stages import (
+    dial_plan,
     gate,
     rank,
     report,
     simulate,
     suite_job,
     train_seeds,
+    turn_dial,
     verdict_of,
 )
 
@@ -116,6 +118,7 @@ def _stages(
     yield "gate"
     made.verdict = gate(run)
     yield "report"
+    turn_dial(run, sources)
     made.page = _drawn(run, made.verdict, recorded, sources)
 
 
@@ -221,14 +224,19 @@ def work_of(
     learned = TRAINED_S * counts["train"] * config.train.epochs
     cases = plan.cases + plan.rounds * plan.takeover_cases if plan.datasets else 0
     demonstrated = DRIVEN_S * len(suite_refs("full", 1)) * cases * plan.duration_s
-    driven = len(job.refs) * job.duration_s + config.drives * DRIVE_S
+    recorded = config.drives * DRIVE_S
+    driven = len(job.refs) * job.duration_s + recorded
+    turned = 0.0  # s that the settings of the dial drive
+    if config.prior_cost.wanted or config.train.residual_on:
+        settings, cases = dial_plan(job)
+        turned = (len(settings) - 2) * (len(cases) * job.duration_s + recorded)
     return {
         "demonstrate": demonstrated + (plan.rounds * learned if plan.datasets else 0.0),
         "train": config.seeds * learned,
         "rank": SEARCH_S + 2.0 * RANKED_S * counts["test"],
         "simulate": DRIVEN_S * rows_of(job) * driven,
         "gate": GATE_S,
-        "report": PAGE_S,
+        "report": PAGE_S + DRIVEN_S * turned,
     }
 
 

@@ -13,6 +13,8 @@ RUN/ranking.json       held-out scenes as the planner sees them, beside baseline
 RUN/ranking_recorded.json   the same with recorded futures
 RUN/likeness.json      held-out drives: how near to the human (and likeness.npz, .txt)
 RUN/suite/             metrics.npz, suite.json, cases.csv, table.txt
+RUN/dial.json          how strongly the learned value counts: drives at several gains
+RUN/dials/N.msgpack    the weights with their gain times N
 RUN/verdict.json       of the gate
 RUN/verdict.txt        its checks and the held-out drives as tables
 RUN/report.html        all of it to look at
@@ -43,9 +45,11 @@ from rcirl_jax.tuning.recipes import PriorCostConfig, SimulatedDemonstrations
 
 # what reads as permission to use weights that are no longer there
 STALE = {
-    **dict.fromkeys(("import", "demonstrate", "train"), ("export", "gate", "report")),
-    **dict.fromkeys(("export", "simulate", "likeness"), ("gate", "report")),
-    **dict.fromkeys(("rank", "gate"), ("report",)),
+    **dict.fromkeys(
+        ("import", "demonstrate", "train"), ("export", "gate", "dial", "report")
+    ),
+    **dict.fromkeys(("export", "simulate", "likeness"), ("gate", "dial", "report")),
+    **dict.fromkeys(("rank", "gate", "dial"), ("report",)),
 }
 NOTED = ("git_commit", "code_sha256", "versions", "flags")  # of every stage
 
@@ -133,6 +137,11 @@ class Run:
     def page(self) -> Path:
         """The report to open."""
         return self.folder / "report.html"
+
+    @property
+    def dial(self) -> Path:
+        """Drives at several gains of the learned value on its own cost."""
+        return self.folder / "dial.json"
 
     @property
     def tuned_idm(self) -> Path:

@@ -8,15 +8,23 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import jax
+import numpy as np
+
 from rcirl_jax.data.store.dataset import Dataset, Demonstrations
 from rcirl_jax.evaluation.baselines import tune_idm
+from rcirl_jax.evaluation.closed_loop import dial
 from rcirl_jax.evaluation.closed_loop.likeness import (
     held_out_likeness,
     read_arrays,
     write_arrays,
 )
 from rcirl_jax.evaluation.closed_loop.runs import read_runs, write_runs
-from rcirl_jax.evaluation.closed_loop.suite import write_suite
+from rcirl_jax.evaluation.closed_loop.suite import (
+    SHORT_S,
+    SuiteConfig,
+    write_suite,
+)
 from rcirl_jax.evaluation.gate.types import CANDIDATE, INCUMBENT, Pair, Verdict
 from rcirl_jax.evaluation.gate.verdict import judge, write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
@@ -24,6 +32,7 @@ from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.report import format_table, from_json, to_json
 from rcirl_jax.export.closed_loop import (
     SuiteJob,
+    drive_by,
     drive_job,
     gate_job,
     left_out,
@@ -34,6 +43,7 @@ from rcirl_jax.export.closed_loop import (
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.loading import open_reward, scorer_of
 from rcirl_jax.export.sweep import SWEEP, read_sweep
+from rcirl_jax.export.weights import save_with_dial
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW
 from rcirl_jax.report.replays import Replay, make_replays
 from rcirl_jax.runtime.atomic_files import read_json, write_json, write_whole
@@ -262,6 +272,97 @@ def simulate(run: Run, sources: Sequence[Dataset]) -> None:
     run.stage("likeness", inputs, [arrays, body, text], compare)
 
 
+def dial_plan(job: SuiteJob) -> tuple[tuple[float, ...], list[int]]:
+    """Returns the settings of the dial that are compared, and on which cases."""
+    short = len(job.refs) * job.duration_s <= SHORT_S
+    settings = dial.FEW_SETTINGS if short else dial.SETTINGS
+    most = dial.FEW_CASES if short else dial.CASES
+    return settings, [i for i, ref in enumerate(job.refs) if ref.index < most]
+
+
+def turn_dial(run: Run, sources: Sequence[Dataset]) -> None:
+    """Compares how strongly the learned value counts, if there is an own cost.
+
+    The first cases of each family and all held-out drives; settings 0 and 1, the own
+    cost alone and the candidate, have driven them already.
+
+    Args:
+      run: folder and settings.
+      sources: what was recorded.
+    """
+    job, _ = suite_job(run)
+    prior = open_reward(str(run.weights)).prior_cost
+    if prior is None or len(job.refs) < 2:
+        return
+    path, folder = run.dial, run.folder / "dials"
+    settings, at = dial_plan(job)
+    files = {x: folder / f"{x:g}.msgpack" for x in settings if x not in (0.0, 1.0)}
+    known = read_arrays(run.folder / "likeness.npz")
+    # the same cases, driven by weights files as rows of the suite are
+    job = dataclasses.replace(
+        job,
+        weights=tuple(map(str, files.values())),
+        names=tuple(f"dial {x:g}" for x in files),
+        baselines=(),
+        planners=(),
+        tuned_idm=None,
+        refs=tuple(job.refs[i] for i in at),
+    )
+    inputs = {
+        "weights": file_sha256(run.weights),
+        "metrics": file_sha256(run.metrics),
+        "likeness": file_sha256(run.folder / "likeness.npz"),
+        "settings": list(settings),
+        "cases": [ref.id for ref in job.refs],
+    }
+
+    def work() -> None:
+        runs, ends = read_runs(run.metrics), {0.0: prior.incumbent, 1.0: CANDIDATE}
+        for x, file in files.items():
+            save_with_dial(run.weights, x, file)
+        drive, cases = drive_by(run.executor, job), job.cases()
+        config = SuiteConfig(plan_every=job.plan_every)
+        drawn = dict(zip(files, job.rows(), strict=True))
+        driven = {x: drive(row, cases, config) for x, row in drawn.items()}
+        driven |= {
+            x: jax.tree.map(lambda leaf: np.asarray(leaf)[at], runs.rows[name])
+            for x, name in ends.items()
+        }
+        drives = held_out(sources, run.config.drives)
+        apart = held_out_likeness(drives, [*drawn.values()], job.plan_every).distance
+        distance = {x: apart[row.name] for x, row in drawn.items()}
+        distance |= {x: known.distance[name] for x, name in ends.items()}
+        found = dial.compare_settings(
+            {x: driven[x] for x in settings},
+            np.asarray(runs.groups)[at],
+            runs.way[at],
+            distance,
+            known.clusters,
+        )
+        names = {**files, 1.0: run.weights}
+        rows = [
+            {
+                "dial": x,
+                "gain": [x * prior.low, x * prior.high],
+                "file": str(names[x].relative_to(run.folder)) if x in names else None,
+                "measures": found[x],
+            }
+            for x in settings
+        ]
+        facts = {
+            "own_cost": prior.incumbent,
+            "cases": len(at),
+            "families": len({runs.groups[i] for i in at}),
+            "duration_s": job.duration_s,
+            "drives": int(known.clusters.size),
+            "vehicles": int(np.unique(known.clusters).size),
+        }
+        made_by = run.provenance()
+        write_json(path, {**facts, "settings": rows, "made_by": made_by})
+
+    run.stage("dial", inputs, [path, *files.values()], work)
+
+
 # Verdict and report
 
 
@@ -312,6 +413,8 @@ def report(
         "dataset": dataset.hash,
         "recipe": config.recipe,
     }
+    if run.dial.exists():
+        inputs["dial"] = file_sha256(run.dial)
     if config.sweep:
         inputs["sweep"] = file_sha256(config.sweep / SWEEP)
 
@@ -332,7 +435,7 @@ def report(
             *(f"train {number}" for number in range(config.seeds)),
             "export",
             *(f"rank {futures}" for futures in FUTURES),
-            *("simulate", "likeness", "gate"),
+            *("simulate", "likeness", "gate", "dial"),
         )
         shown = {  # without `made_by`, which the page says once
             name: {key: x for key, x in stages[name].items() if key != "made_by"}
@@ -352,6 +455,7 @@ def report(
                 replays=_replays(run, verdict, sources),
                 workdir=_folder_of(run, decided, seed),
                 sweep=read_sweep(config.sweep) if config.sweep else None,
+                dial=read_json(run.dial, "a dial") if run.dial.exists() else None,
                 likeness=(run.folder / "likeness.txt").read_text(),
                 training_runs=config.seeds,
                 facts={"recipe": config.recipe, **run.facts, "stages": shown},

@@ -27,6 +27,9 @@ rounds = 1
 duration_s = 45.0
 stride_s = 8.0
 takeover_stride_s = 4.0
+[prior_cost]
+low = 0.3
+high = 2.0
 """
 
 
@@ -56,9 +59,9 @@ def test_a_small_loop(tmp_path):
     for bar in ("rank the scenes", "drive the cases: candidate", "draw the report"):
         assert bar in done.stderr
     stages = [
-        "import 0", "demonstrate 0", "demonstrate learner 1", "demonstrate 1",
-        "train 0", "export", "tune", "rank predicted", "rank recorded", "simulate",
-        "likeness", "gate", "report",
+        "import 0", "demonstrate 0", "prior cost 1", "demonstrate learner 1",
+        "demonstrate 1", "prior cost 2", "train 0", "export", "tune", "rank predicted",
+        "rank recorded", "simulate", "likeness", "gate", "dial", "report",
     ]  # fmt: skip
     assert kept(done) == dict.fromkeys(stages, False)
     verdict = json.loads((run / "verdict.json").read_text())
@@ -77,6 +80,17 @@ def test_a_small_loop(tmp_path):
     assert rows | {"random weights", "recorded human"} == set(likeness["rows"])
     table = (run / "suite" / "table.txt").read_text()
     assert all(name in table for name in rows)
+    dial = json.loads((run / "dial.json").read_text())
+    assert (dial["own_cost"], dial["cases"], dial["drives"]) == ("hand-set", 4, 6)
+    settings = {one["dial"]: one["measures"]["distance"] for one in dial["settings"]}
+    assert list(settings) == [0.0, 0.5, 1.0, 2.0]
+    for setting, name in ((0.0, "hand-set"), (1.0, "candidate")):
+        mean = likeness["rows"][name]["distance_m"]["mean"]
+        assert settings[setting]["value"] == pytest.approx(mean)
+    turned = (run / "dials" / "0.5.msgpack").read_bytes()
+    flags_of_dial = ("--dial=0.5", f"--output={tmp_path / 'turned'}")
+    succeeded("rcirl_jax", "export", f"--weights={run}/weights.msgpack", *flags_of_dial)
+    assert (tmp_path / "turned").read_bytes() == turned
     kinds = {check["kind"] for check in verdict["checks"]}
     assert {"safety", "trivial baselines", "likeness", "gain"} <= kinds
     noted = json.loads((run / "stages.json").read_text())["stages"]

@@ -25,6 +25,7 @@ from rcirl_jax.export import (
     save,
     to_json,
 )
+from rcirl_jax.export.weights import save_with_dial
 from rcirl_jax.runtime.specs import spec_root
 from tests.export.wrong import body_of
 from tests.helpers.weights_files import (
@@ -290,6 +291,23 @@ def test_a_prior_cost_needs_samples_that_fit():
             pack(weights, wrong, valid, values)
     with pytest.raises(InputError, match=r"samples\.features\[0, 0, 0\]: nan"):
         pack(weights, features * np.nan, valid, values)
+
+
+def test_a_dial_multiplies_the_gain_and_nothing_else(tmp_path):
+    weights = example_weights(with_prior=True)
+    samples = example_samples(weights)
+    was = save(tmp_path / "was", weights, *samples)
+    now = save_with_dial(tmp_path / "was", 2.5, tmp_path / "now")
+    assert (now.prior_cost.low, now.prior_cost.high) == (0.625, 3.75)
+    np.testing.assert_allclose(now.gain(samples[0]), 2.5 * was.gain(samples[0]))
+    np.testing.assert_array_equal(now.value(samples[0]), was.value(samples[0]))
+    assert now.provenance["dial"] == {"of_sha256": was.sha256, "times": 2.5}
+    with pytest.raises(InputError, match="dial: 0: expected above 0"):
+        save_with_dial(tmp_path / "was", 0.0, tmp_path / "none")
+    plain = example_weights()
+    save(tmp_path / "plain", plain, *example_samples(plain))
+    with pytest.raises(InputError, match="plain: prior_cost: none: expected weights"):
+        save_with_dial(tmp_path / "plain", 2.0, tmp_path / "none")
 
 
 def test_samples_of_other_weights_are_refused():

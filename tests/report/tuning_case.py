@@ -7,6 +7,7 @@ import numpy as np
 
 from rcirl_jax.data.importing import import_logs
 from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.evaluation.closed_loop.dial import FEW_SETTINGS, compare_settings
 from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns
 from rcirl_jax.evaluation.gate.types import GateConfig, Pair
 from rcirl_jax.evaluation.gate.verdict import judge
@@ -78,6 +79,27 @@ def ranking():
     return build_report(Ranked(table=table, outcomes=outcomes), num_resamples=200)
 
 
+def dial_result():
+    """A run's dial.json of made-up drives."""
+    families = np.repeat(FAMILIES, EACH)
+    vehicles = np.arange(20) // 2
+    found = compare_settings(
+        {x: metrics(number) for number, x in enumerate(FEW_SETTINGS)},
+        families, np.full(families.size, 1100.0),
+        {x: np.random.default_rng(3).gamma(2.0, 2.0, 20) - x for x in FEW_SETTINGS},
+        vehicles,
+    )  # fmt: skip
+    files = {0.5: "dials/0.5.msgpack", 1.0: "weights.msgpack", 2.0: "dials/2.msgpack"}
+    return {
+        "own_cost": "hand-set", "cases": families.size, "families": len(FAMILIES),
+        "duration_s": 120.0, "drives": 20, "vehicles": 10,
+        "settings": [
+            {"dial": x, "gain": [0.3 * x, 2.0 * x], "file": files.get(x), "measures": y}
+            for x, y in found.items()
+        ],
+    }  # fmt: skip
+
+
 def small_report(folder, replays):
     """The report; everything but the drives, the frames and the features is made up."""
     import_logs(write_logs(folder / "logs", 4), folder / "set", CONFIG)
@@ -99,7 +121,7 @@ def small_report(folder, replays):
         gate=GateConfig(), suite=suite, incumbent="hand-set", ranking=ranking(),
         rewards={"candidate": candidate, "incumbent": incumbent},
         dataset=open_dataset(folder / "set"), replays=replays, workdir=workdir,
-        sweep=sweep_result(), training_runs=3,
+        sweep=sweep_result(), dial=dial_result(), training_runs=3,
         facts={"flags": {"seed": 3}, "git_commit": "abc", "stages": {"train": "12ef"}},
     )  # fmt: skip
 
