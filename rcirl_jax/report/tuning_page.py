@@ -275,11 +275,11 @@ def dial_view(dial: Mapping | None) -> dict | None:
         return interval((found["value"], found["low"], found["high"]), digits)
 
     def difference(found: Mapping, digits: int) -> str:
-        ends = (
-            math.nan if x is None else x
-            for x in (found["minus_own"][key] for key in ("mean", "low", "high"))
+        apart = found["minus_own"]
+        low, high = (
+            math.nan if apart[x] is None else apart[x] for x in ("low", "high")
         )
-        return interval(tuple(ends), digits, signed=True)
+        return interval((apart["mean"], low, high), digits, signed=True)
 
     return {
         **dial,
