@@ -33,7 +33,8 @@ from rcirl_jax.tuning.run import Run, TuneConfig
 
 USUAL = (
     *("output", "data", "input", "format", "source", "synthetic", "recipe"),
-    *("incumbent", "suite", "cases", "duration", "drives", "until", "workers"),
+    *("incumbent", "sampler", "suite", "cases", "duration", "drives", "until"),
+    "workers",
 )
 _OUTPUT = flags.DEFINE_string("output", None, shared.OUTPUT, required=True)
 _DATA = flags.DEFINE_list("data", None, "datasets of `rcirl import`, with commas")

@@ -7,6 +7,7 @@ command stands in its own module. No flag has a default where a recipe has one.
 
 import dataclasses
 import functools
+import os
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
@@ -26,6 +27,7 @@ from rcirl_jax.planner.baselines import TUNED_IDM_ROW
 from rcirl_jax.reward import LOSSES
 from rcirl_jax.reward.network import CONSTRAINTS, SCALE_CONSTRAINTS
 from rcirl_jax.runtime.executors import EXECUTORS, Executor, make_executor
+from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.sampling.sampler import MODES
 from rcirl_jax.train.state import (
     ADMISSIBLE_IN,
@@ -227,6 +229,10 @@ class Training:
             said |= dict(zip(names, floats(margins, "margins"), strict=True))
         if (mode := values.get("mode")) is not None:
             said["sampler"] = dataclasses.replace(base.sampler, mode=mode)
+        if place := values.get("sampler"):
+            sampler = said.get("sampler", base.sampler)
+            own = SamplerConfig(own=os.path.abspath(place))
+            said["sampler"] = own.on_own(sampler)
         if (units := values.get("hidden_size")) is not None:
             said["hidden"] = hidden_sizes(units)
         if hidden is not None:
@@ -256,6 +262,12 @@ def _departures(without: Collection[str]) -> dict[str, flags.FlagHolder]:
             made[name] = flags.DEFINE_enum(name, None, list(kind), text + AS_SAID)
     made["mode"] = flags.DEFINE_enum(
         "mode", None, list(MODES), "what the sampler varies" + AS_SAID
+    )
+    made["sampler"] = flags.DEFINE_string(
+        "sampler",
+        None,
+        "FILE.py:FUNCTION, your planner's own candidates in the place of ours, offline "
+        "and online",
     )
     made["margins"] = flags.DEFINE_list(
         "margins", None, "hinge: per metre from the human, collision, rule" + AS_SAID

@@ -24,6 +24,7 @@ from rcirl_jax.cli import flags as shared
 from rcirl_jax.cli.flags import AS_SAID, floats, hidden_sizes
 from rcirl_jax.cli.running import provenance
 from rcirl_jax.errors import InputError
+from rcirl_jax.export.closed_loop import checked_sampler
 from rcirl_jax.export.sweep import CHOICES, SweepConfig, run_sweep, table
 from rcirl_jax.train.state import TrainConfig
 
@@ -91,6 +92,7 @@ def main() -> None:
         )
     shapes = tuple(hidden_sizes(s.split("x"), "hidden_sizes") for s in _HIDDEN.value)
     base = _TRAINING.config(seed=_SEED.value, hidden=shapes[0] if shapes else None)
+    checked_sampler(base.sampler)
     config = SweepConfig(
         data=tuple(_DATA.value),
         base=dataclasses.replace(base, epochs=2) if _QUICK.value else base,

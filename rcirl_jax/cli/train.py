@@ -20,6 +20,7 @@ from rcirl_jax.cli import flags as shared
 from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.dataset import open_datasets
 from rcirl_jax.data.store.splits import with_tags
+from rcirl_jax.export.closed_loop import checked_sampler
 from rcirl_jax.train.loop import Running, train
 from rcirl_jax.train.parallel import PARALLEL, is_first, join_processes, share_cores
 
@@ -67,6 +68,7 @@ def main() -> None:
     config = _TRAINING.config(seed=_SEED.value)
     if _PARALLEL.value == "auto" and _PROCESSES.value is None:
         share_cores(config.batch_size)
+    checked_sampler(config.sampler)
     dataset = open_datasets(_DATA.value, _VERIFY.value, _TRAINING.data_weights)
     dataset = with_tags(dataset, _TAGS.value)
     running = Running(

@@ -44,6 +44,7 @@ from rcirl_jax.export.loading import (
     familiarity_of,
     open_reward,
     own_cost_of,
+    own_sampler_of,
     reward_params,
     row_names,
 )
@@ -74,7 +75,8 @@ from rcirl_jax.reward import RewardConfig
 from rcirl_jax.runtime.atomic_files import read_json, write_json
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.runtime.executors import Executor
-from rcirl_jax.sampling import sample
+from rcirl_jax.sampling import SamplerConfig, sample
+from rcirl_jax.sampling.own_sampler import check_own_sampler
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.simulation.recorded import held_out
@@ -177,7 +179,8 @@ def table_rows(
         raise InputError("weights: none: expected at least one file or planner")
     rewards = [open_reward(path) for path in weights]
     user = own_cost_of(rewards, own)
-    config = RankConfig(safety=SafetyConfig(track=track), own=user)
+    sampler = own_sampler_of(rewards, ONLINE)
+    config = RankConfig(sampler=sampler, safety=SafetyConfig(track=track), own=user)
     rows = _learned_rows(rewards, names, config)
     first = rewards[0] if rewards else None
     preset, params, activation = _program_of(first)
@@ -433,6 +436,24 @@ def checked_own_cost(place: str) -> OwnCost:
     candidates = draw(keys, scenes)
     check_own_cost(cost, scenes, candidates, BASELINES)
     return cost
+
+
+@functools.cache
+def checked_sampler(config: SamplerConfig) -> SamplerConfig:
+    """A sampler, asked about the first scenes of the catalogue if it is a user's own.
+
+    Raises:
+      InputError: there is none, or no planner could choose from its candidates
+        (`check_own_sampler`).
+    """
+    if config.own:
+        cases = build(suite_refs("full", CHECKED_PER_FAMILY, seed=1), 1.0)
+        scenes = first_scenes(cases)
+        keys = jax.random.split(jax.random.key(0), len(cases.steps))
+        draw = jax.jit(jax.vmap(lambda key, scene: sample(key, scene, config)))
+        made = draw(keys, scenes)
+        check_own_sampler(config.own, config.mode == "speed", scenes, keys, made)
+    return config
 
 
 @functools.cache

@@ -180,6 +180,9 @@ def write_weights(
     x, valid = map(jnp.asarray, samples)
     values = value(RewardModel(config.reward), params, normaliser, x, valid)
     features = feature_map(config.features)
+    if config.sampler.own:
+        named = {"place": config.sampler.own, "sha256": config.sampler.own_sha256}
+        provenance = {**provenance, "own_sampler": named}
     effective = effective_params(params, config.reward)
     kernels, biases = layers_of(effective["point"])
     weights = Reward(

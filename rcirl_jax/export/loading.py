@@ -37,7 +37,7 @@ _SAID: dict[str, type] = {
     **dict.fromkeys(("seed", "steps"), int),
     **dict.fromkeys(("git_commit", "dataset_sha256", "created", "mode"), str),
     **dict.fromkeys(("flags", "metrics", "versions", "config", "sweep"), dict),
-    "own_cost": dict,
+    **dict.fromkeys(("own_cost", "own_sampler"), dict),
 }
 
 
@@ -158,6 +158,35 @@ def own_cost_of(rewards: Sequence[Reward], place: str = "") -> OwnCost | None:
             f"own cost: {', '.join(found)}: expected one for all rows of a table"
         )
     return next(iter(found.values()), None)
+
+
+def own_sampler_of(rewards: Sequence[Reward], base: SamplerConfig) -> SamplerConfig:
+    """Return a grid, or the user's own candidates that rewards are made for.
+
+    Args:
+      rewards: each names in its provenance where its own candidates were made.
+      base: the grid where there are none, and the vehicle's limits.
+
+    Raises:
+      InputError: two own samplers; one that is not where it was, or has changed.
+    """
+    found: dict[str, SamplerConfig] = {}
+    for reward in rewards:
+        was = reward.provenance.get("own_sampler") or {}
+        if not was or was["sha256"] in found:
+            continue
+        own = SamplerConfig(own=was["place"])
+        if own.own_sha256 != was["sha256"]:
+            raise InputError(
+                f"{reward.file}: own sampler {was['place']}: it is no longer the one "
+                "that the reward was tuned with: expected the same file, or a new "
+                "tuning"
+            )
+        found[own.own_sha256] = own.on_own(base)
+    if len(found) > 1:
+        places = ", ".join(x.own for x in found.values())
+        raise InputError(f"own sampler: {places}: expected one for all rows of a table")
+    return next(iter(found.values()), base)
 
 
 def compiled_scorer(reward: Reward) -> Scorer:
@@ -284,5 +313,6 @@ def load_runs(
     runs: dict[str, list[Scorer | PriorCostScorer]] = {}
     for reward, (row, _) in zip(rewards, _rows(rewards), strict=True):
         runs.setdefault(row, []).append(scorer_of(reward))
-    sampler, own = SamplerConfig(mode=mode), own_cost_of(rewards)
+    sampler = own_sampler_of(rewards, SamplerConfig(mode=mode))
+    own = own_cost_of(rewards)
     return runs, RankingSetup(preset=preset, sampler=sampler, own=own)

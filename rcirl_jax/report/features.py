@@ -27,7 +27,11 @@ from rcirl_jax.evaluation.statistics import (
     combine_seeds,
     paired_difference,
 )
-from rcirl_jax.export.loading import prior_cost_words, reward_params
+from rcirl_jax.export.loading import (
+    own_sampler_of,
+    prior_cost_words,
+    reward_params,
+)
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.responses import OUTER, Response, responses
 from rcirl_jax.features import feature_map
@@ -88,7 +92,7 @@ def contributions(
         raise InputError("data: split test: 1 vehicle: expected at least 2")
     bootstrap = ClusterBootstrap(np.asarray(rows.vehicle))
     first = next(iter(rewards.values()))
-    sampler = SamplerConfig(mode=str(first.provenance.get("mode", "speed")))
+    sampler = own_sampler_of([first], SamplerConfig(mode=first.mode))
     found = {
         name: _shares_of(reward, rows, index, sampler)
         for name, reward in rewards.items()

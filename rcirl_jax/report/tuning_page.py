@@ -32,6 +32,7 @@ from rcirl_jax.evaluation.ranking.report import (
     format_table,
 )
 from rcirl_jax.evaluation.statistics import CONFIDENCE
+from rcirl_jax.export.loading import own_sampler_of
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.sweep import table as sweep_table
 from rcirl_jax.report.charts import (
@@ -125,7 +126,7 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
     """
     suite, workdir = summarise(report.suite), report.workdir
     reward = next(iter(report.rewards.values()))
-    sampler = SamplerConfig(mode=str(reward.provenance.get("mode", "speed")))
+    sampler = own_sampler_of([reward], SamplerConfig(mode=reward.mode))
     quality = ""
     if isinstance(report.dataset, Dataset):
         quality = format_quality(report.dataset.manifest.quality)

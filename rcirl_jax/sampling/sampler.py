@@ -5,7 +5,8 @@ polynomials of all of them and one rolls them out. Only positions are made here;
 derivatives come from `kinematics`. All profiles start in the ego's state (s, v, a).
 After its own duration a profile goes on at its end speed; one that reverses stands
 still instead. Offline and online the sampler is the same: (key, scene, config) ->
-Candidates.
+Candidates. A user's own candidates (`own_sampler`) take the place of the families, but
+for constant speed and the emergency stops, which the safety filter needs.
 """
 
 import dataclasses
@@ -25,6 +26,12 @@ from rcirl_jax.sampling.kinematics import (
     running_max,
     trajectory_from_positions,
     trajectory_on_path,
+)
+from rcirl_jax.sampling.own_sampler import (
+    START_M,
+    file_sha256,
+    own_count,
+    own_positions,
 )
 from rcirl_jax.types import Candidates, Kind, Scene, Trajectory
 from rcirl_jax.units import DT_S, HORIZON_S, NUM_TIMES, STATION_STEP_M, TIMES_S
@@ -99,11 +106,21 @@ class SamplerConfig:
     max_curvature: float = 0.1979
     # m/s^2 (Apollo's 4, with room for the noise of recorded paths)
     max_lateral_acceleration: float = 6.0
+    # FILE.py:FUNCTION of the user's own candidates, "" for the grid above, and the
+    # sha256 of the file
+    own: str = ""
+    own_sha256: str = ""
 
     def __post_init__(self) -> None:
-        """Reject an unknown mode."""
+        """Reject an unknown mode; hash the file of own candidates."""
         if self.mode not in MODES:
             raise InputError(f"mode: {self.mode}: expected one of {MODES}")
+        if self.own and not self.own_sha256:
+            object.__setattr__(self, "own_sha256", file_sha256(self.own))
+
+    def on_own(self, base: "SamplerConfig") -> "SamplerConfig":
+        """Returns another grid, with own candidates in its place if there are any."""
+        return dataclasses.replace(base, own=self.own, own_sha256=self.own_sha256)
 
 
 FAMILIES = (
@@ -120,6 +137,7 @@ FAMILIES = (
     "given",  # somebody else's, by its positions
 )
 
+START_MPS = 0.5  # m/s between the ego's speed and that of own candidates, at first
 MIN_PHASE_S = 0.5  # s, shortest phase of a two-phase profile
 
 
@@ -141,6 +159,11 @@ def as_candidates(trajectory: Trajectory) -> Candidates:
 
 def _speed_families(config: SamplerConfig) -> np.ndarray:
     """Family number of every speed profile, in the order they are built."""
+    if config.own:
+        count = own_count(config.own, config.own_sha256)
+        counts = (1, count, len(config.emergency_brakings))
+        numbers = [family_index(x) for x in ("constant_speed", "given", "emergency")]
+        return np.repeat(numbers, counts).astype(np.int32)
     num_stop = len(config.stop_times) * len(config.stop_gaps)
     num_edge = len(config.edge_times)
     counts = {
@@ -175,7 +198,7 @@ def _pairs(config: SamplerConfig) -> tuple[np.ndarray, np.ndarray]:
 
 def num_candidates(config: SamplerConfig) -> int:
     """K, fixed by the configuration alone."""
-    if config.mode == "speed":
+    if config.mode == "speed" or config.own:
         return _speed_families(config).size
     return _pairs(config)[0].size
 
@@ -200,6 +223,11 @@ def sample(key: jax.Array, scene: Scene, config: SamplerConfig) -> Candidates:
                 scene, stations
             )
             allowed = jnp.ones(family.shape, bool)
+        elif config.own:
+            trajectory = jax.vmap(trajectory_from_positions, in_axes=(None, 0, 0))(
+                scene, stations, _own_offsets(key, scene, stations, config)
+            )
+            allowed = jnp.ones(family.shape, bool)
         else:
             which_speed, which_lateral = _pairs(config)
             target, length, allowed = lateral_targets(scene, config)
@@ -213,6 +241,8 @@ def sample(key: jax.Array, scene: Scene, config: SamplerConfig) -> Candidates:
             allowed = allowed[which_lateral] > 0.0
         inside = jax.vmap(lambda x: within_limits(scene, x, config))(trajectory)
         is_emergency = family == family_index("emergency")
+        if config.own:
+            allowed = _begins(scene, stations, config) | is_emergency
         return Candidates(
             trajectory=trajectory,
             feasible=(inside | is_emergency) & allowed,
@@ -228,6 +258,10 @@ def speed_profiles(
     Reversing is replaced by standing still.
     """
     ego, times = scene.ego, jnp.asarray(TIMES_S)
+    coasting = (ego.s + ego.v * times)[None]  # what a car does when nobody drives it
+    if config.own:
+        given, _ = own_positions(config.own, config.own_sha256, scene, key)
+        return running_max(jnp.concatenate([coasting, given, emergency(scene, config)]))
     random = _random_phases(key, scene, config)
     cruising, ways = _cruise(scene, config), _to_states(scene, config)
     # quartics: cruise and the first phases; quintics: stop, follow, overtake
@@ -244,7 +278,7 @@ def speed_profiles(
     count = cruising[0].size
     first = slice(count, speeds.size)
     stations = [
-        (ego.s + ego.v * times)[None],  # what a car does when nobody drives it
+        coasting,
         rolled[:count],
         rolled[speeds.size :],
         envelope(scene, config),
@@ -252,6 +286,38 @@ def speed_profiles(
         _second_phases(random, to_speed[first], value[first]),
     ]
     return running_max(jnp.concatenate(stations))
+
+
+def _begins(
+    scene: Scene, stations: Float[Array, "m t"], config: SamplerConfig
+) -> jax.Array:
+    """True [M] for profiles that go on from the ego's place and speed, as ours all do.
+
+    Derivatives at t = 0 are the ego's own: a jump there would not be seen in them.
+    """
+    there = jnp.abs(stations[:, 0] - scene.ego.s) < START_M
+    mean = (stations[:, 1] - stations[:, 0]) / DT_S  # m/s, of the first step
+    low, high = 0.5 * config.min_acceleration, 0.5 * config.max_acceleration
+    gained = mean - scene.ego.v
+    kept = (gained > low * DT_S - START_MPS) & (gained < high * DT_S + START_MPS)
+    return there & kept
+
+
+def _own_offsets(
+    key: jax.Array, scene: Scene, stations: Float[Array, "m t"], config: SamplerConfig
+) -> Float[Array, "m t"]:
+    """L [M, T] m of own candidates, and the offset that is held by what stands beside.
+
+    Raises:
+      InputError: stations alone are given.
+    """
+    _, given = own_positions(config.own, config.own_sha256, scene, key)
+    if given is None:
+        raise InputError(f"{config.own}: s alone: expected s, l where l is planned")
+    target, length, _ = lateral_targets(scene, config)
+    hold = jax.vmap(lambda s: lateral_offset(scene, target[0], length[0], s))(stations)
+    after = 1 + given.shape[0]
+    return jnp.concatenate([hold[:1], given, hold[after:]])
 
 
 def reachable_speeds(

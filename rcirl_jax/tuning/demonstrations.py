@@ -28,7 +28,7 @@ from rcirl_jax.data.store.dataset import (
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import checked_own_cost, table_rows
 from rcirl_jax.planner.own_cost import is_place
-from rcirl_jax.planner.rank import Params, Policy, RankConfig
+from rcirl_jax.planner.rank import ONLINE, Params, Policy, RankConfig
 from rcirl_jax.runtime.pipeline import digest, file_sha256
 from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
 from rcirl_jax.simulation.rows import baseline_row, drawn_weights
@@ -119,6 +119,7 @@ def _round(run: Run, number: int, learner: Path | None) -> Dataset:
         "number": number,
         "expert": run.incumbent_hash() if plan.expert != "driver model" else "",
         "learner": file_sha256(learner) if learner else "",
+        "sampler": run.config.train.sampler.own_sha256,
     }
     key = digest({**inputs, **run.code()})[:8]
     folder = run.folder / f"demonstrations-{key}" / str(number)
@@ -171,7 +172,7 @@ def expert_of(
             own.name if own else "hand-set",
             config.features,
             drawn_weights(config.features, config.reward),
-            RankConfig(own=own),
+            RankConfig(sampler=config.sampler.on_own(ONLINE), own=own),
             config.reward.activation,
         )
     else:

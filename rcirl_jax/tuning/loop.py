@@ -19,7 +19,7 @@ from rcirl_jax.data.store.dataset import Dataset, Demonstrations, shares_of
 from rcirl_jax.errors import InputError, extra_of
 from rcirl_jax.evaluation.gate.types import CANDIDATE, Verdict
 from rcirl_jax.evaluation.gate.words import WIDTH
-from rcirl_jax.export.closed_loop import SuiteJob
+from rcirl_jax.export.closed_loop import SuiteJob, checked_sampler
 from rcirl_jax.export.loading import open_reward, prior_cost_words
 from rcirl_jax.planner import own_cost
 from rcirl_jax.runtime.compiling import compiles
@@ -75,6 +75,8 @@ def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
     job, _ = suite_job(run, tuned=False)
     shares = shares_of(run.config.data_weights, len(given))
     _check_incumbent(run)
+    if checked_sampler(run.config.train.sampler).own:
+        run.say(f"candidates: {run.config.train.sampler.own}")
     if run.own_cost:
         run.say(own_cost.words(run.own_cost))
     names, made = STAGES[: STAGES.index(last) + 1], Made()

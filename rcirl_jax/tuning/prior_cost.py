@@ -37,7 +37,7 @@ from rcirl_jax.reward.familiarity import (
     of_the_scene,
 )
 from rcirl_jax.runtime.atomic_files import read_json, write_json
-from rcirl_jax.sampling import sample, trajectory_on_path
+from rcirl_jax.sampling import SamplerConfig, sample, trajectory_on_path
 from rcirl_jax.sampling.sampler import as_candidates
 from rcirl_jax.tuning.recipes import PriorCostConfig
 from rcirl_jax.tuning.run import Run
@@ -62,6 +62,7 @@ def fitted_prior_cost(
     elsewhere: Sequence[Dataset],
     features: FeatureMap,
     own: OwnCost | None = None,
+    sampler: SamplerConfig = ONLINE,
 ) -> PriorCost:
     """The prior cost of a weights file, from the training splits.
 
@@ -80,6 +81,7 @@ def fitted_prior_cost(
       elsewhere: simulated demonstrations.
       features: of the reward.
       own: the user's own cost; None: the hand-set one.
+      sampler: of the planner.
     """
     mine = [_training_scenes(one, features) for one in recorded]
     pairs = zip(mine, shares, strict=True)
@@ -96,7 +98,8 @@ def fitted_prior_cost(
     name, unit = OWN_COST, 1.0
     if own is not None:
         scenes, rows = some_scenes(recorded)
-        each = unit_of(scenes, rows, own.score), unit_of(scenes, rows, hand_score)
+        unit_by = functools.partial(unit_of, scenes, rows, sampler=sampler)
+        each = unit_by(own.score), unit_by(hand_score)
         name, unit = own.name, float(each[0] / each[1])
     low, high = config.low * unit, config.high * unit
     return PriorCost(incumbent=name, low=low, high=high, **arrays)
@@ -112,20 +115,23 @@ def some_scenes(sources: Sequence[Demonstrations]) -> tuple[Scene, np.ndarray]:
     return scenes, np.concatenate(rows)
 
 
-@functools.partial(jax.jit, static_argnames="score")
-def unit_of(scenes: Scene, rows: jax.Array, score: Score) -> jax.Array:
+@functools.partial(jax.jit, static_argnames=("score", "sampler"))
+def unit_of(
+    scenes: Scene, rows: jax.Array, score: Score, sampler: SamplerConfig = ONLINE
+) -> jax.Array:
     """The unit [] of a cost, by the equation of `fitted_prior_cost`.
 
     Args:
       scenes: [S] of logs.
       rows: [S] of them in their dataset, which seed the candidates.
       score: minus the cost.
+      sampler: of the planner.
     """
 
     def one(item: tuple[Scene, jax.Array]) -> jax.Array:
         scene = with_predicted_futures(item[0])
         scene = scene.replace(time_valid=jnp.ones_like(scene.time_valid))
-        candidates = sample(candidates_key(item[1]), scene, ONLINE)
+        candidates = sample(candidates_key(item[1]), scene, sampler)
         costs = -score(None, scene, candidates)
         costs = jnp.where(candidates.feasible, costs, jnp.nan)
         return jnp.nanquantile(costs, 0.25) - jnp.nanmin(costs)
@@ -270,12 +276,14 @@ def fit_prior_cost(
         "drives": [one.hash for one in drives],
         "features": config.train.features,
         "own_cost": run.own_cost.sha256 if run.own_cost else OWN_COST,
+        "sampler": config.train.sampler.own_sha256,
     }
+    online = config.train.sampler.on_own(ONLINE)
 
     def work() -> None:
         features = feature_map(config.train.features)
         made = fitted_prior_cost(
-            config.prior_cost, sources, shares, drives, features, run.own_cost
+            config.prior_cost, sources, shares, drives, features, run.own_cost, online
         )
         write_prior_cost(path, made)
 
@@ -305,10 +313,12 @@ def on_own_cost(run: Run, sources: Sequence[Dataset]) -> Run:
     inputs = {
         "own_cost": run.own_cost.sha256 if run.own_cost else OWN_COST,
         "recorded": [one.hash for one in sources],
+        "sampler": train.sampler.own_sha256,
     }
+    online = train.sampler.on_own(ONLINE)
 
     def work() -> None:
-        unit = float(unit_of(*some_scenes(sources), own_score(place)))
+        unit = float(unit_of(*some_scenes(sources), own_score(place), online))
         write_json(path, {"own_cost": place, "unit": unit})
 
     run.stage("own unit", inputs, [path], work)

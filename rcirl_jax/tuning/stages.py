@@ -158,15 +158,26 @@ def rank(run: Run, dataset: Demonstrations) -> None:
     """
     config, path = run.config, run.tuned_idm
     evaluations, search = IDM_EVALUATIONS, config.search
-    inputs = {"dataset": dataset.hash, "evaluations": evaluations, "search": search}
+    inputs = {
+        "dataset": dataset.hash,
+        "evaluations": evaluations,
+        "search": search,
+        "sampler": config.train.sampler.own_sha256,
+    }
 
     def work() -> None:
-        setup = RankingSetup(horizon_s=config.horizon_s)
+        setup = RankingSetup(horizon_s=config.horizon_s, sampler=_ranked_sampler(run))
         write_tuned_idm(path, tune_idm(dataset, setup, evaluations, search))
 
     run.stage("tune", inputs, [path], work)
     for futures in FUTURES:
         _rank(run, dataset, futures)
+
+
+def _ranked_sampler(run: Run) -> SamplerConfig:
+    """Returns the usual grid, whatever the training's, or the user's own candidates."""
+    trained = run.config.train.sampler
+    return trained.on_own(SamplerConfig(mode=trained.mode))
 
 
 def _rank(run: Run, dataset: Demonstrations, futures: str) -> None:
@@ -191,7 +202,7 @@ def _rank(run: Run, dataset: Demonstrations, futures: str) -> None:
             learned[INCUMBENT] = [scorer_of(known)]
         setup = RankingSetup(
             preset=str(rewards[0].preset),
-            sampler=SamplerConfig(mode=config.train.sampler.mode),
+            sampler=_ranked_sampler(run),
             horizon_s=config.horizon_s,
             futures=futures,
             tuned={TUNED_IDM_ROW: [tuned]},
