@@ -86,19 +86,26 @@ def own_positions(
 @functools.cache
 def own_count(place: str, sha256: str) -> int:
     """K of the user's candidates."""
-    single = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.float32)  # noqa: E731
-    flag = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.bool_)  # noqa: E731
-    names = lambda kind: [x.name for x in dataclasses.fields(kind)]  # noqa: E731
-    others = dict.fromkeys(names(Obstacles), single(NUM_OBSTACLES, NUM_TIMES))
-    others |= {"valid": flag(NUM_OBSTACLES, NUM_TIMES)}
-    others |= {"kind": jax.ShapeDtypeStruct((NUM_OBSTACLES,), jnp.int32)}
-    others |= dict.fromkeys(("a", "l_dot"), single(NUM_OBSTACLES))
+
+    def blank(*shape: int, kind: Any = jnp.float32) -> Any:  # noqa: ANN401
+        return jax.ShapeDtypeStruct(shape, kind)
+
+    def alike(of: type, *shape: int) -> dict[str, Any]:
+        return {field.name: blank(*shape) for field in dataclasses.fields(of)}
+
+    others = {
+        **alike(Obstacles, NUM_OBSTACLES, NUM_TIMES),
+        "valid": blank(NUM_OBSTACLES, NUM_TIMES, kind=jnp.bool_),
+        "kind": blank(NUM_OBSTACLES, kind=jnp.int32),
+        "a": blank(NUM_OBSTACLES),
+        "l_dot": blank(NUM_OBSTACLES),
+    }
     scene = Scene(
-        ego=Ego(**dict.fromkeys(names(Ego), single())),
-        path=Path(**dict.fromkeys(names(Path), single(NUM_STATIONS))),
+        ego=Ego(**alike(Ego)),
+        path=Path(**alike(Path, NUM_STATIONS)),
         obstacles=Obstacles(**others),
-        time_valid=flag(NUM_TIMES),
-        tags=flag(len(Tag)),
+        time_valid=blank(NUM_TIMES, kind=jnp.bool_),
+        tags=blank(len(Tag), kind=jnp.bool_),
     )
     made = jax.eval_shape(
         lambda scene: own_positions(place, sha256, scene, jax.random.key(0))[0], scene
