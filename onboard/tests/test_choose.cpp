@@ -14,32 +14,8 @@
 namespace {
 
 constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
-constexpr float kDt = 8.0f / 17.0f;
+constexpr float kDt = kStationDt;
 constexpr std::size_t kCount = 40;
-
-// A file that reads the station alone, on the usual times, and likes the furthest.
-Example likes_speed() {
-  Example example(1, rcirl::kTimes, {}, "identity", false);
-  example.lower = {-1e6f};
-  example.upper = {1e6f};
-  example.location = {0.0f};
-  example.scale = {1.0f};
-  example.gamma.assign(rcirl::kTimes, 1.0f);
-  example.kernels = {{1.0f}};
-  example.biases = {{0.0f}};
-  return example;
-}
-
-std::string with_station(const Example& example, Fields fields) {
-  std::vector<float> times;
-  for (std::size_t t = 0; t < rcirl::kTimes; ++t) times.push_back(kDt * static_cast<float>(t));
-  const std::string station = pack::map({{"name", pack::text("station")},
-                                         {"unit", pack::text("m")},
-                                         {"none_value", pack::real(0.0)}});
-  WithPriorCost::put(fields, "features", pack::list({station}));
-  WithPriorCost::put(fields, "times", pack::array({example.times}, times));
-  return pack::sealed(pack::map(fields));
-}
 
 rcirl::Reward loaded(const std::string& file) {
   rcirl::Reward reward;

@@ -99,4 +99,52 @@ struct WithPriorCost {
   }
 };
 
+constexpr std::size_t kStationTimes = 18;
+constexpr float kStationDt = 8.0f / 17.0f;
+
+// A file that reads the station alone, on the usual times, and likes the furthest.
+inline Example likes_speed() {
+  Example example(1, kStationTimes, {}, "identity", false);
+  example.lower = {-1e6f};
+  example.upper = {1e6f};
+  example.location = {0.0f};
+  example.scale = {1.0f};
+  example.gamma.assign(kStationTimes, 1.0f);
+  example.kernels = {{1.0f}};
+  example.biases = {{0.0f}};
+  return example;
+}
+
+inline std::string with_station(const Example& example, Fields fields) {
+  std::vector<float> times;
+  for (std::size_t t = 0; t < kStationTimes; ++t) times.push_back(kStationDt * static_cast<float>(t));
+  const std::string station = pack::map({{"name", pack::text("station")},
+                                         {"unit", pack::text("m")},
+                                         {"none_value", pack::real(0.0)}});
+  WithPriorCost::put(fields, "features", pack::list({station}));
+  WithPriorCost::put(fields, "times", pack::array({example.times}, times));
+  return pack::sealed(pack::map(fields));
+}
+
+// The same on a prior cost, with one gain everywhere.
+inline std::string with_gain(const Example& example, float gain) {
+  const auto one = [](float value) { return pack::array({1}, {value}); };
+  Fields fields = example.body();
+  const std::string familiarity =
+      pack::map({{"location", one(0.0f)},
+                 {"scale", one(1.0f)},
+                 {"kernel", pack::array({1, 1}, {0.0f})},
+                 {"bias", one(0.0f)},
+                 {"out", one(0.0f)},
+                 {"offset", one(0.0f)}});
+  WithPriorCost::put(fields, "prior_cost",
+                     pack::map({{"incumbent", pack::text("hand-set")},
+                                {"low", pack::real(double{gain})},
+                                {"high", pack::real(double{gain})},
+                                {"familiarity", familiarity}}));
+  WithPriorCost::put(fields, "samples",
+                     example.sample_fields(pack::filled({example.samples}, gain)));
+  return with_station(example, fields);
+}
+
 #endif  // RCIRL_TESTS_WITH_PRIOR_COST_HPP_
