@@ -1,6 +1,7 @@
 """Files cut from one stream: a vehicle that drives on is one, in one split."""
 
 import dataclasses
+import functools
 import re
 
 import numpy as np
@@ -13,6 +14,7 @@ from rcirl_jax.data.scenes.config import CollectConfig
 from tests.helpers.driven_roads import crossing, highway
 
 
+@functools.cache
 def stream(shift=0.0, cars=60):
     """Rows t, id, x, y of cars that start every 1.4 s and drive for 40 s."""
     rows = []
@@ -33,7 +35,7 @@ def written(folder, name, rows, clock=lambda t: f"{7000.0 + t:.1f}"):
 def cut(folder, names, edges, **options):
     """The stream in a file for each name, in the order of time."""
     folder.mkdir()
-    rows = stream(cars=60 if len(edges) == 1 else 180)
+    rows = stream(cars=60 if len(edges) == 1 else 100)
     ends = zip([0.0, *edges], [*edges, 1e9], strict=True)
     for name, (low, high) in zip(names, ends, strict=True):
         own = [row for row in rows if low <= row[0] < high]
@@ -65,16 +67,21 @@ y = "y"
 """
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+PIECES, WHOLE = 1, 10**9
+
+
 @pytest.mark.parametrize(
-    ("names", "edges", "options"),
+    ("names", "edges", "options", "long_bytes"),
     [
-        ("ab", [60.0], {}),
-        ("ba", [60.0], {}),  # the second file may be named before the first
-        ("acb", [85.0, 170.0], {}),  # the last meets a vehicle with two names
-        ("ab", [60.0], {"clock": before_midnight}),
+        ("ab", [60.0], {}, PIECES),
+        ("ab", [60.0], {}, WHOLE),
+        # the second file may be named before the first
+        ("ba", [60.0], {}, PIECES),
+        # the last meets a vehicle with two names
+        ("acb", [60.0, 110.0], {}, PIECES),
+        ("acb", [60.0, 110.0], {}, WHOLE),
+        ("ab", [60.0], {"clock": before_midnight}, WHOLE),
     ],
-    ids=["", "second first", "middle last", "over midnight"],
 )
 def test_a_stream_cut_into_files(tmp_path, names, edges, options, long_bytes):
     logs, source = cut(tmp_path / "logs", names, edges, **options), tmp_path / "s.toml"
@@ -91,7 +98,7 @@ def test_a_stream_cut_into_files(tmp_path, names, edges, options, long_bytes):
     assert train
     assert test
     assert not train & test
-    rows = stream(cars=180)
+    rows = stream(cars=100)
     of_file = [{row[1] for row in rows if row[0] < edge} for edge in edges]
     after = [{row[1] for row in rows if row[0] >= edge} for edge in edges]
     both = sum(len(a & b) for a, b in zip(of_file, after, strict=True))

@@ -29,8 +29,8 @@ SPEEDS = np.arange(4.0, 14.0)  # m/s
 
 
 @pytest.fixture(scope="module")
-def reader(tmp_path_factory):
-    return built(tmp_path_factory.mktemp("onboard"), "reader") / "reader"
+def reader():
+    return built("reader") / "reader"
 
 
 def box(kind, s, speed=0.0 * T, length=4.5, width=1.8):

@@ -40,8 +40,8 @@ def stranger(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def twin(tmp_path_factory):
-    return built(tmp_path_factory.mktemp("onboard"), "own_planner") / "own_planner"
+def twin():
+    return built("own_planner") / "own_planner"
 
 
 def in_python(stranger, *arguments):
@@ -117,7 +117,7 @@ def test_the_twin_names_what_is_wrong(twin):
 
 
 def test_choose_adds_a_reward_with_a_prior_cost_to_the_costs(tmp_path):
-    choose = built(tmp_path / "build", "choose") / "choose"
+    choose = built("choose") / "choose"
     weights, features, *_ = golden()
     features = features.astype("<f4")
     costs = np.linspace(2.0, -3.0, len(features), dtype="<f4")

@@ -32,8 +32,8 @@ SITES = {  # below the recorded data
 
 
 @pytest.fixture(scope="module")
-def reader(tmp_path_factory):
-    return built(tmp_path_factory.mktemp("onboard"), "reader") / "reader"
+def reader():
+    return built("reader") / "reader"
 
 
 @pytest.fixture(scope="module")

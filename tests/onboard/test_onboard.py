@@ -34,8 +34,8 @@ WITH_PRIOR = packed(
 
 
 @pytest.fixture(scope="module")
-def programs(tmp_path_factory):
-    return built(tmp_path_factory.mktemp("onboard"), "reader", "choose")
+def programs():
+    return built("reader", "choose")
 
 
 def verdicts(programs, files, folder):

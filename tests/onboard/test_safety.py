@@ -18,8 +18,8 @@ ROUNDING = 1e-3  # m, m/s, m/s^2 by which limits move for rulings that rounding 
 
 
 @pytest.fixture(scope="module")
-def reader(tmp_path_factory):
-    return built(tmp_path_factory.mktemp("onboard"), "reader") / "reader"
+def reader():
+    return built("reader") / "reader"
 
 
 def moved(by):

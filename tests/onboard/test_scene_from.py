@@ -16,8 +16,8 @@ NO_CANDIDATES = np.zeros((0, 18))
 
 
 @pytest.fixture(scope="module")
-def program(tmp_path_factory):
-    folder = built(tmp_path_factory.mktemp("onboard"), "build_scene")
+def program():
+    folder = built("build_scene")
     return folder / "build_scene"
 
 

@@ -11,10 +11,10 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import checked_own_cost
 from rcirl_jax.planner import own_cost as module
 from rcirl_jax.planner.own_cost import OwnCost, check_own_cost, own_cost
-from rcirl_jax.planner.rank import ONLINE, RankConfig
+from rcirl_jax.planner.rank import ONLINE, RankConfig, rank_policy
 from rcirl_jax.sampling import sample
 from rcirl_jax.simulation.rollout import first_scenes
-from rcirl_jax.simulation.rows import baseline_row
+from rcirl_jax.simulation.rows import Row, baseline_row
 from rcirl_jax.simulation.suite import (
     build,
     drive_row,
@@ -62,26 +62,33 @@ def test_jax_numpy_and_c_say_the_same(some, library):
     assert own_cost(library).name == "headway"
 
 
-def driven(place_of):
-    """Metrics of ten short cases with a cost alone."""
-    own = own_cost(place_of) if place_of else None
-    name = own.name if own else "hand-set"
-    row = baseline_row(name, "paper21", untrained(), RankConfig(own=own))
+def driven(row, seconds):
+    """Metrics of ten short cases."""
     refs = suite_refs("cut_in,traffic", 5)
-    cases = lambda a, b: build(refs[a:b], 6.0)  # noqa: E731
-    return drive_row(row, cases, len(refs), rollout_config(row, 6.0, 1), chunk=30)
+    cases = lambda a, b: build(refs[a:b], seconds)  # noqa: E731
+    config = rollout_config(row, seconds, 1)
+    return drive_row(row, cases, len(refs), config, chunk=30)
 
 
 def test_a_copy_of_the_hand_set_cost_drives_as_it_does():
-    ours, theirs = driven(place("copied")), driven("")
+    config = RankConfig(own=own_cost(place("copied")))
+    ours, theirs, other = (
+        driven(baseline_row(name, "paper21", untrained(), config), 4.0)
+        for name in ("copied", "hand-set", "+velocity")
+    )
     assert all(jax.tree.leaves(jax.tree.map(np.array_equal, ours, theirs)))
+    assert not np.array_equal(ours.progress, other.progress)
 
 
 def test_what_is_called_back_drives_as_what_is_traced(library):
-    by_jax, by_c = driven(place("headway_cost")), driven(library)
+    by_jax, by_c, times_seven = (
+        driven(Row(name="alone", policy=rank_policy(cost.score, RankConfig())), 4.0)
+        for cost in map(
+            own_cost, (place("headway_cost"), library, place("seven_and_three"))
+        )
+    )
     np.testing.assert_allclose(by_c.progress, by_jax.progress, rtol=1e-3)
     assert np.ptp(by_jax.progress) > 5.0
-    times_seven = driven(place("seven_and_three"))
     np.testing.assert_allclose(times_seven.progress, by_jax.progress, rtol=1e-3)
 
 

@@ -15,12 +15,13 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.train.loop import restore_run
 from rcirl_jax.train.parallel import EXIT_LOST, join_processes
 from tests.conftest import REPO
+from tests.helpers.commands import QUICKLY
 from tests.helpers.stored import assert_same_bits, leaves
 from tests.train.worker import CONFIG
 
 pytestmark = pytest.mark.multiprocess
-# compiled four times as fast; what is compared is compiled alike
-QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+# compiled eight times as fast; what is compared is compiled alike
+QUICK = f"{QUICKLY} --xla_llvm_disable_expensive_passes=true"
 STEPS = 6  # 21 rows, batches of 8, two epochs: the last batch of an epoch has 5
 
 

@@ -66,8 +66,8 @@ def test_only_simulated_scenes_are_slowed_and_their_candidates_admitted(made):
     recorded = jax.tree.map(lambda x: x[1], given.demonstrations)
     recorded = recorded.replace(scene=with_predicted_futures(recorded.scene))
     assert int(given.index[1]) == 1
-    candidates = candidates_of(key, recorded, CONFIG)
-    values = hand_score(None, recorded.scene, candidates) / CONFIG.own_unit
+    candidates = jax.jit(lambda *x: candidates_of(*x, CONFIG))(key, recorded)
+    values = jax.jit(hand_score)(None, recorded.scene, candidates) / CONFIG.own_unit
     np.testing.assert_allclose(found.info.own[1], values, rtol=1e-4, atol=1e-4)
     speed = feature_map(CONFIG.features).names.index("velocity")
     shown = np.asarray(found.human)[:, 0, speed]
@@ -77,7 +77,7 @@ def test_only_simulated_scenes_are_slowed_and_their_candidates_admitted(made):
     assert drawn <= {0.0, 0.5, 1.0}
     assert len(drawn) == 3
     # the rows of the recorded scene count what the filter would refuse, too
-    refused = ~np.asarray(check(recorded.scene, candidates).admissible)
+    refused = ~np.asarray(jax.jit(check)(recorded.scene, candidates).admissible)
     assert (np.asarray(found.feasible)[1] & refused).any()
 
 
@@ -101,9 +101,9 @@ def test_seven_times_the_cost_learns_the_same():
         place = f"tests/planner/costs/costs.py:{name}"
         config = dataclasses.replace(CONFIG, residual_on=place, own_unit=unit)
         state, step = init_state(config, normaliser()), make_train_step(config)
-        given = batch()
+        given, step = batch(), jax.jit(step)
         for _ in range(3):
-            state, metrics = jax.jit(step)(state, given)
+            state, metrics = step(state, given)
             assert bool(metrics.finite)
         found.append(state.params)
     assert float(found[0]["log_beta"]) != 0.0
