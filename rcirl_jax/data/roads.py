@@ -16,7 +16,6 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import savgol_filter
 from scipy.spatial import KDTree
 
 from rcirl_jax.types import Kind, Lane, Track
@@ -130,6 +129,9 @@ def _thinned(track: Track) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     step = float(np.median(np.diff(track.t)))
     window = min(max(round(SMOOTH_S / step), 5), len(points))
     window -= 1 - window % 2
+    # takes a quarter of a second, which other commands need not wait for
+    from scipy.signal import savgol_filter
+
     smooth = np.asarray(savgol_filter(points, window, 2, axis=0))
     moves = np.hypot(*np.diff(smooth, axis=0).T) * (track.speed[1:] > MOVING_MPS)
     arc = np.append(0.0, np.cumsum(moves))

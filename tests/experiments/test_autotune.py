@@ -24,7 +24,7 @@ expert = "own cost"
 cases = 1
 takeover_cases = 1
 rounds = 1
-duration_s = 24.0
+duration_s = 45.0
 stride_s = 8.0
 takeover_stride_s = 4.0
 [prior_cost]

@@ -2,9 +2,8 @@
 
 import pytest
 
-from rcirl_jax.data.formats import read_recordings
-from rcirl_jax.data.importing import ImportConfig, import_logs
-from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.importing import import_logs
+from tests.data.small_logs import CONFIG, write_logs
 from tests.helpers.commands import refused
 from tests.helpers.weights_files import random_weights
 
@@ -90,8 +89,7 @@ WRONG = (
 def places(tmp_path_factory):
     """A dataset and a weights file."""
     folder = tmp_path_factory.mktemp("wrong")
-    config = ImportConfig(format="synthetic", collect=CollectConfig(stride_s=120.0))
-    import_logs(read_recordings("synthetic", None), folder / "data", config)
+    import_logs(write_logs(folder / "logs", 3), folder / "data", CONFIG)
     weights = random_weights(folder / "w.msgpack")
     return {"data": folder / "data", "weights": weights}
 

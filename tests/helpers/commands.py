@@ -27,8 +27,7 @@ LONGEST_S = 1800.0
 FORKING = """
 import gc, json, os, runpy, shutil, sys
 import matplotlib.pyplot
-import rcirl_jax.evaluation.ranking.evaluate, rcirl_jax.evaluation.ranking.learners
-import rcirl_jax.report.charts, rcirl_jax.simulation.suite
+import rcirl_jax.data.importing, rcirl_jax.report.charts, rcirl_jax.tuning.loop
 
 gc.freeze()
 for line in sys.stdin:

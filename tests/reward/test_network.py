@@ -90,7 +90,7 @@ def test_a_scene_in_one_pass_is_each_trajectory_by_itself(name, gated):
 
     def both(form):
         total = lambda params: (jnp.sum(jnp.sin(form(params))), form(params))  # noqa: E731
-        return jax.grad(total, has_aux=True)(drawn(config))
+        return jax.jit(jax.grad(total, has_aux=True))(drawn(config))
 
     near = lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-5)  # noqa: E731
     jax.tree.map(near, both(together), both(apart))

@@ -22,10 +22,15 @@ def sigmoid(x):
     return 1.0 / (1.0 + math.exp(-x))
 
 
+@jax.jit
+def columns(made, way):
+    frame = make_frame(made, way)
+    return {name: COLUMNS[name](frame) for name in NAMES}
+
+
 def by_loops(made, way, w):
     """The docstring's sum, a time at a time in float64."""
-    frame = make_frame(made, way)
-    column = {name: np.asarray(COLUMNS[name](frame), np.float64) for name in NAMES}
+    column = {name: np.asarray(x, np.float64) for name, x in columns(made, way).items()}
     v, a, j, s = (np.asarray(getattr(way, x), np.float64) for x in "vajs")
     total, hit = 0.0, False
     for t in range(T):
@@ -45,14 +50,16 @@ def by_loops(made, way, w):
     return total + hit * w.collision_check
 
 
+COST = jax.jit(lambda made, way, w: speed_dp_cost(made, way, SpeedDpCost(**w)))
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_equals_its_definition(seed):
     made, rng = random_scene(seed), np.random.default_rng(seed)
     speed = rng.uniform(2, 15) + rng.normal(0, 1.0, T).cumsum()
     stations = np.concatenate([[0.0], np.maximum(speed[1:], 0.0).cumsum() * DT_S])
-    way = trajectory_from_positions(made, jnp.asarray(stations), jnp.zeros(T))
+    way = jax.jit(trajectory_from_positions)(made, jnp.asarray(stations), jnp.zeros(T))
     # without the charge of a crash, which hides the rest
     for weights in (SpeedDpCost(collision_check=0.0), SpeedDpCost()):
-        cost = jax.jit(lambda x: speed_dp_cost(made, way, SpeedDpCost(**x)))
-        found = float(cost(weights.fields()))
+        found = float(COST(made, way, weights.fields()))
         assert found == pytest.approx(by_loops(made, way, weights), rel=2e-4)
