@@ -30,6 +30,9 @@ QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_write
   tests/export/test_forms.py tests/export/test_reader.py tests/export/test_weights.py \
   tests/features/test_features.py::test_equals_the_oracle tests/report/test_data_page.py
 QUICKLY = -m pytest -q -m "not slow and not dataset" $(QUICK)
+# with other versions: compiled quickly, and no files of damaged bytes
+OTHERS = XLA_FLAGS="--xla_backend_optimization_level=0 $(XLA_FLAGS)"
+UNDAMAGED = -k "not changed_bytes and not damaged_files"
 # an environment that is used once: what is never imported need not be compiled
 ONCE := $(PIP) install --no-compile
 
@@ -102,7 +105,7 @@ test-long: setup
 # The quick tests with the oldest versions allowed; they run among newer neighbours that
 # announce changes to come, so such announcements are no errors here
 test-floor: build/floor/.installed
-	build/floor/bin/python $(QUICKLY) -W default::DeprecationWarning
+	$(OTHERS) build/floor/bin/python $(QUICKLY) $(UNDAMAGED) -W default::DeprecationWarning
 
 build/floor/.installed: pyproject.toml requirements/floor.lock
 	rm -rf build/floor
@@ -116,7 +119,7 @@ test-ceiling:
 	rm -rf build/ceiling
 	$(PYTHON) -m venv build/ceiling
 	build/ceiling/bin/python $(ONCE) --editable '.[quick]'
-	build/ceiling/bin/python $(QUICKLY)
+	$(OTHERS) build/ceiling/bin/python $(QUICKLY) $(UNDAMAGED)
 
 # Source distribution, a wheel made of it, and far from this folder, in an environment of what the
 # wheel itself asks for, in the locked versions: the help of every command without any extra, and the
