@@ -24,17 +24,18 @@ from rcirl_jax.data.formats import IMPORTERS
 from rcirl_jax.data.formats.recognise import recognised_format
 from rcirl_jax.data.importing import ImportConfig, Logs
 from rcirl_jax.errors import InputError, did_you_mean
+from rcirl_jax.export.closed_loop import write_today
 from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.train.loop import Running
 from rcirl_jax.train.parallel import PARALLEL, share_cores
 from rcirl_jax.tuning.loop import STAGES, tune
 from rcirl_jax.tuning.recipes import EXPERTS
-from rcirl_jax.tuning.run import Run, TuneConfig
+from rcirl_jax.tuning.run import TODAY, Run, TuneConfig
 
 USUAL = (
     *("output", "data", "input", "format", "source", "synthetic", "recipe"),
-    *("incumbent", "sampler", "suite", "cases", "duration", "drives", "until"),
-    "workers",
+    *("terms", "incumbent", "sampler", "suite", "cases", "duration", "drives"),
+    *("until", "workers"),
 )
 _OUTPUT = flags.DEFINE_string("output", None, shared.OUTPUT, required=True)
 _DATA = flags.DEFINE_list("data", None, "datasets of `rcirl import`, with commas")
@@ -54,7 +55,8 @@ _INCUMBENT = flags.DEFINE_string(
     "incumbent",
     "hand-set",
     "what drives today, to be compared with: a weights file, a baseline, your own "
-    "cost, FILE.py:FUNCTION or FILE.so, or planner:COMMAND, a program that plans",
+    "cost, FILE.py:FUNCTION or FILE.so, or planner:COMMAND, a program that plans; with "
+    "--terms, where it is not given, today's weights",
 )
 _SEEDS = flags.DEFINE_integer(
     "seeds", None, "training runs; the median one drives" + AS_SAID
@@ -90,6 +92,8 @@ def main() -> None:
     """Flags -> one run of the loop."""
     given, one = sources(), made_run(Path(_OUTPUT.value))
     with only_one(one.folder):
+        if one.config.incumbent == str(one.today):
+            write_today(one.today, one.config.train)
         tune(one, given, _UNTIL.value)
 
 
@@ -102,10 +106,13 @@ def made_run(folder: Path) -> Run:
     train = _TRAINING.config()
     if _PARALLEL.value == "auto":
         share_cores(train.batch_size)
+    incumbent = _INCUMBENT.value
+    if train.reward.today and not _INCUMBENT.present:
+        incumbent = str(folder / TODAY)
     config = TuneConfig(
         train=train,
         gate=_MARGINS(),
-        incumbent=_INCUMBENT.value,
+        incumbent=incumbent,
         simulated=simulated,
         prior_cost=recipe.prior_cost,
         data_weights=_TRAINING.data_weights,

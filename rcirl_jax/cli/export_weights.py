@@ -3,6 +3,7 @@
     rcirl export --run=RUN --output=FILE
     rcirl export --weights=FILE --onnx=FILE --stablehlo=FILE
     rcirl export --weights=LINEAR --yaml=FILE
+    rcirl export --weights=FILE --into=PLANNER.yaml --output=NEW.yaml
     rcirl export --run=RUN --stablehlo=FILE
     rcirl export --weights=FILE --dial=0.5 --output=FILE
 
@@ -33,11 +34,13 @@ from rcirl_jax.export.forms import (
     exported,
     exported_run,
     reward_yaml,
+    terms_yaml,
+    with_weights,
     write_onnx,
     write_stablehlo,
 )
 from rcirl_jax.export.from_run import datasets_of, export_run, tags_of
-from rcirl_jax.export.loading import open_reward
+from rcirl_jax.export.loading import features_of, open_reward
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.weights import save_with_dial
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
@@ -76,6 +79,12 @@ _JAX = flags.DEFINE_string(
 _YAML = flags.DEFINE_string(
     "yaml", None, "file to write: costs by name, of a linear reward"
 )
+_INTO = flags.DEFINE_string(
+    "into",
+    None,
+    "your planner's parameter file: --output is that file with the tuned weights of "
+    "your own terms, found by their names",
+)
 FORMS: dict[str, Form] = {"stablehlo": "stablehlo", "jax_export": "jax"}
 
 
@@ -89,6 +98,18 @@ def main() -> None:
             raise InputError("--dial: expected --weights and --output with it, no more")
         made = save_with_dial(_WEIGHTS.value, _DIAL.value, _OUTPUT.value)
         print(f"{_OUTPUT.value}: {made.prior_cost}, sha256 {made.sha256[:16]}...")
+    elif _INTO.value:
+        if not _WEIGHTS.value or not _OUTPUT.value:
+            raise InputError("--into: expected with --weights and --output")
+        theirs, output = Path(_INTO.value), Path(_OUTPUT.value)
+        try:
+            text = theirs.read_text("utf-8")
+        except (OSError, ValueError) as error:
+            raise InputError(f"--into: {theirs}: {error}: expected text") from error
+        write_whole(
+            output, with_weights(text, open_reward(_WEIGHTS.value), str(theirs))
+        )
+        print(f"written: {output}")
     elif _WEIGHTS.value:
         _convert(open_reward(_WEIGHTS.value), files)
     elif _ONNX.value or _YAML.value:
@@ -116,7 +137,10 @@ def _convert(reward: Reward, files: Mapping[str, Path]) -> None:
             f"--weights: {reward.file}: expected a reward without a prior cost: these "
             "forms hold V alone, and the gain on top of the own cost would be lost"
         )
-    text = reward_yaml(reward) if "yaml" in files else ""
+    text = ""
+    if "yaml" in files:
+        of_terms = features_of(reward).own is not None
+        text = terms_yaml(reward) if of_terms else reward_yaml(reward)
     for name, path in files.items():
         if name == "yaml":
             write_whole(path, text)

@@ -36,7 +36,13 @@ from rcirl_jax.train.state import (
     TrainConfig,
 )
 from rcirl_jax.train.trackers import TRACKERS
-from rcirl_jax.tuning.recipes import DEFAULT, Recipe, load_recipe, override
+from rcirl_jax.tuning.recipes import (
+    DEFAULT,
+    TERMS,
+    Recipe,
+    load_recipe,
+    override,
+)
 
 OUTPUT = "folder of the run; a run that is in it goes on"
 
@@ -147,7 +153,8 @@ def recipe() -> Callable[[], Recipe]:
     name = flags.DEFINE_string(
         "recipe",
         DEFAULT,
-        "tuned, paper, quick or a TOML of your own: settings that no flag gives",
+        "tuned, paper, quick, residual, terms or a TOML of your own: settings that no "
+        "flag gives",
     )
     return lambda: load_recipe(name.value)
 
@@ -184,7 +191,10 @@ _TRAINING: dict[str, tuple[type | Sequence[str], str]] = {
         "near negatives drawn for each that the present reward keeps",
     ),
     "activation": (("tanh", "relu", "leaky_relu"), "of the hidden layers"),
-    "constraint": (CONSTRAINTS, "nonnegative costs (linear), monotone in safety"),
+    "constraint": (
+        CONSTRAINTS,
+        "nonnegative costs (linear), monotone in safety, weights of own --terms",
+    ),
     "scale_constraint": (SCALE_CONSTRAINTS, "what fixes the scale of the reward"),
     "module": (str, "PACKAGE.MODULE:CLASS, a linen module as R_theta"),
 }
@@ -207,6 +217,12 @@ class Training:
         """Share of each of several --data."""
         return self.given["data_weights"].value
 
+    @property
+    def terms(self) -> str:
+        """Place of the user's own terms, whole; "" for none."""
+        given = self.given["terms"].value
+        return os.path.abspath(given) if given else ""
+
     def config(
         self, *, seed: int = 0, hidden: tuple[int, ...] | None = None
     ) -> TrainConfig:
@@ -222,6 +238,10 @@ class Training:
         base = self.recipe().train
         values = {name: flag.value for name, flag in self.given.items()}
         said = {name: values[name] for name in _TRAINING if name in values}
+        if self.terms:
+            if said.get("features"):
+                mutually_exclusive("terms", "features")
+            said["features"] = self.terms
         if (margins := values.get("margins")) is not None:
             if len(margins) != 3:
                 raise InputError(f"--margins: {margins}: expected three numbers")
@@ -247,7 +267,13 @@ def training(*, without: Collection[str] = ()) -> Training:
     Args:
       without: names of flags that the command does not have.
     """
-    return Training(recipe=recipe(), given=_departures(without))
+    named, given = recipe(), _departures(without)
+
+    def chosen() -> Recipe:
+        of_terms = given["terms"].value and not flags.FLAGS["recipe"].present
+        return load_recipe(TERMS) if of_terms else named()
+
+    return Training(recipe=chosen, given=given)
 
 
 @_subject("Training: what may depart from the recipe")
@@ -260,6 +286,12 @@ def _departures(without: Collection[str]) -> dict[str, flags.FlagHolder]:
             made[name] = _DEFINE[kind](name, None, text + AS_SAID)
         else:
             made[name] = flags.DEFINE_enum(name, None, list(kind), text + AS_SAID)
+    made["terms"] = flags.DEFINE_string(
+        "terms",
+        None,
+        "FILE.py:NAME, your planner's own cost terms in the place of --features, with "
+        "--recipe=terms unless it is given",
+    )
     made["mode"] = flags.DEFINE_enum(
         "mode", None, list(MODES), "what the sampler varies" + AS_SAID
     )

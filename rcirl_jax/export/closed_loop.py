@@ -40,6 +40,7 @@ from rcirl_jax.evaluation.gate.types import (
     Verdict,
 )
 from rcirl_jax.evaluation.gate.verdict import judge, repeats
+from rcirl_jax.export.from_run import NUM_SAMPLES, write_weights
 from rcirl_jax.export.loading import (
     familiarity_of,
     open_reward,
@@ -49,6 +50,7 @@ from rcirl_jax.export.loading import (
     row_names,
 )
 from rcirl_jax.export.reader import Reward
+from rcirl_jax.export.weights import PROVENANCE_KEYS
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm, Yielding
 from rcirl_jax.planner.dp import DpConfig, dp_policy
@@ -71,7 +73,7 @@ from rcirl_jax.planner.rank import (
     ranking_score,
 )
 from rcirl_jax.planner.safety import SafetyConfig
-from rcirl_jax.reward import RewardConfig
+from rcirl_jax.reward import RewardConfig, fit_normaliser, init_params, seen_range
 from rcirl_jax.runtime.atomic_files import read_json, write_json
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.runtime.executors import Executor
@@ -101,7 +103,8 @@ from rcirl_jax.simulation.suite import (
     rollout_config,
     suite_refs,
 )
-from rcirl_jax.types import Normaliser, RewardParams
+from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.types import Candidates, Normaliser, RewardParams, Scene
 
 DP_EVERY = 10  # steps between two plans of the DP row: it costs 1,000 rankings
 NO_WEIGHTS = "paper21"  # features of "random weights" in a table without any
@@ -418,7 +421,7 @@ def gate_job(
     return job, INCUMBENT if theirs else incumbent
 
 
-CHECKED_PER_FAMILY = 10  # scenes of a family that an own cost is asked about
+CHECKED_PER_FAMILY = 10  # scenes of a family that own costs and terms are asked about
 
 
 @functools.cache
@@ -429,13 +432,73 @@ def checked_own_cost(place: str) -> OwnCost:
       InputError: there is none, or no planner could rank by it (`check_own_cost`).
     """
     cost = own_cost(place)
+    check_own_cost(cost, *_asked_about(), BASELINES)
+    return cost
+
+
+def _asked_about() -> tuple[Scene, Candidates]:
+    """The first scenes of the catalogue and their candidates, leaves [n, ...]."""
     cases = build(suite_refs("full", CHECKED_PER_FAMILY, seed=1), 1.0)
     scenes = first_scenes(cases)
     keys = jax.random.split(jax.random.key(0), len(cases.steps))
     draw = jax.jit(jax.vmap(lambda key, scene: sample(key, scene, ONLINE)))
-    candidates = draw(keys, scenes)
-    check_own_cost(cost, scenes, candidates, BASELINES)
-    return cost
+    return scenes, draw(keys, scenes)
+
+
+def write_today(path: Path, train: TrainConfig) -> Reward:
+    """Writes the weights with which own terms drive today, as a weights file.
+
+    The terms are asked about the first scenes of the catalogue before.
+
+    Args:
+      path: file to write.
+      train: `features` are the place of own terms, whose weights are learned.
+
+    Raises:
+      InputError: a term is not finite of a feasible candidate, or today's cost is the
+        same for all candidates of most scenes.
+    """
+    features = feature_map(train.features)
+    scenes, candidates = _asked_about()
+    one = jax.tree.map(lambda x: x[0], (scenes, candidates))
+    jax.eval_shape(features.of_candidates, *one)  # finds out whether JAX traces them
+    if features.own and features.own.is_called_back:
+        rows = features.own.called(scenes, candidates.trajectory)  # [S, F, T, K]
+        x = rows.transpose(0, 3, 2, 1)
+    else:
+        x = np.asarray(jax.jit(jax.vmap(features.of_candidates))(scenes, candidates))
+    feasible = np.asarray(candidates.feasible)
+    wrong = ~np.isfinite(x).all(axis=2) & feasible[..., None]
+    if wrong.any():
+        scene, which, term = np.argwhere(wrong)[0]
+        raise InputError(
+            f"{features.preset}: {features.names[term]}: scene {scene}, candidate "
+            f"{which}: expected a finite number for every feasible candidate"
+        )
+    cost = np.where(feasible, x.mean(axis=2) @ train.reward.today, np.nan)
+    alike = np.nanmax(cost, axis=1) == np.nanmin(cost, axis=1)
+    if np.mean(alike) > 0.5:
+        raise InputError(
+            f"{features.preset}: in {np.mean(alike):.0%} of {len(alike)} scenes all "
+            "candidates cost the same today: expected terms that tell them apart"
+        )
+    rows = x[feasible].reshape(-1, features.num_features)
+    normaliser = fit_normaliser(rows, features, train.reward.today)
+    some = x[np.arange(NUM_SAMPLES), 0]
+    provenance = {
+        **dict.fromkeys(PROVENANCE_KEYS),
+        "mode": train.sampler.mode,
+        "metrics": {},
+    }
+    return write_weights(
+        path,
+        init_params(jax.random.key(0), features.num_features, train.reward),
+        normaliser,
+        train,
+        (some, np.ones(some.shape[:2], bool)),
+        provenance,
+        seen_range(rows, features),
+    )
 
 
 @functools.cache

@@ -21,11 +21,15 @@ the nearest terms of that planner's cost.yaml. Its terms are integrals of square
 of absolute values over seconds, so the weights are matched where a feature departs from
 the usual by its spread: a start for its planner, not the same cost. A free linear
 reward has none: it wants more of a feature or less, never the usual.
+
+Weights of own terms (`features.terms`) come under their own names, beside today's, and
+go into the planner's own parameter file in the place of the numbers there.
 """
 
 import json
+import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +37,7 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.from_run import read_config
-from rcirl_jax.export.loading import reward_params
+from rcirl_jax.export.loading import features_of, reward_params
 from rcirl_jax.export.reader import RANGES, Reward
 from rcirl_jax.reward import (
     Normaliser,
@@ -45,10 +49,8 @@ from rcirl_jax.reward import (
 from rcirl_jax.runtime.atomic_files import write_whole
 from rcirl_jax.train.loop import restore_run
 
-if TYPE_CHECKING:
-    pass
-
 Form = Literal["jax", "stablehlo"]
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 OPSET, IR = 17, 8  # of ONNX
 ACTIVATIONS = {"tanh": "Tanh", "relu": "Relu", "leaky_relu": "LeakyRelu"}
 NOT_INSTALLED = "not installed: expected pip install 'rcirl-jax[export]'"
@@ -262,6 +264,104 @@ def reward_yaml(reward: Reward) -> str:
             weights[name] = cost * per_second / float(reward.scale[i]) ** (power - 1)
     terms = (f"    {name}: {_number(x)}\n" for name, x in weights.items())
     return text + YAML_FRENETIX + "".join(terms)
+
+
+def own_weights(reward: Reward) -> dict[str, tuple[float, float]]:
+    """Return of each own term the weight today and the tuned one.
+
+    Only their ratios decide, so the tuned ones have the geometric mean of today's.
+
+    Raises:
+      InputError: the reward is not one of weights of own terms.
+    """
+    own, kernels = features_of(reward).own, reward.kernels
+    slope = -np.asarray(kernels[0], np.float64)[:, 0] / reward.scale
+    if own is None or len(kernels) > 1 or np.any(slope <= 0.0):
+        raise InputError(
+            f"{reward.file}: {reward.preset}: expected weights of own terms"
+        )
+    today = np.asarray(own.weights)
+    tuned = slope * np.exp(np.mean(np.log(today) - np.log(slope)))
+    pairs = zip(own.names, today, tuned, strict=True)
+    return {name: (float(before), float(after)) for name, before, after in pairs}
+
+
+def terms_yaml(reward: Reward) -> str:
+    """Return the document of weights of own terms."""
+    rows = own_weights(reward)
+    blocks = {"weights": 1, "today": 0}
+    parts = [
+        f"{block}:\n" + "".join(f"  {n}: {_number(x[i])}\n" for n, x in rows.items())
+        for block, i in blocks.items()
+    ]
+    return (
+        "schema: rcirl-jax/own-terms\nschema_version: 1\n"
+        f'source: {{weights_sha256: "{reward.sha256}"}}\n'
+        "# cost = sum_i weight_i mean over times of term_i; only ratios matter\n"
+        + "".join(parts)
+    )
+
+
+def with_weights(text: str, reward: Reward, file: str) -> str:
+    """Return a planner's parameter file with the tuned weights in it.
+
+    Two ways of writing are known, of which everything else in the file is kept:
+
+        NAME: 0.2                                   or NAME = 0.2
+        name: [A, NAME, B] with score_weight: [1.0, 0.2, 3.0] of that length
+
+    The second is that of Autoware's trajectory ranker, whose list of metrics is called
+    `name`.
+
+    Args:
+      text: of the file.
+      reward: weights of own terms.
+      file: its name, for messages.
+
+    Raises:
+      InputError: a term is not there, or more than once.
+    """
+    found: dict[str, list[tuple[int, int]]] = {name: [] for name in own_weights(reward)}
+    for name, spans in found.items():
+        line = rf"^[ \t]*(?:- )?[\"']?{re.escape(name)}[\"']?[ \t]*[:=][ \t]*({NUMBER})"
+        spans += [one.span(1) for one in re.finditer(line, text, re.MULTILINE)]
+    items = lambda key: list(re.finditer(rf"\b{key}[ \t]*:[ \t]*\[([^\]]*)\]", text))  # noqa: E731
+    for names, numbers in zip(items("name"), items("score_weight"), strict=False):
+        called = [x.strip(" \t\n\"'") for x in names[1].split(",")]
+        places = list(re.finditer(NUMBER, numbers[1]))
+        if len(called) != len(places):
+            raise InputError(
+                f"{file}: score_weight: {len(places)} numbers: expected {len(called)}, "
+                "one for each name"
+            )
+        for name, at in zip(called, places, strict=True):
+            if name in found:
+                start, end = at.span()
+                found[name].append((numbers.start(1) + start, numbers.start(1) + end))
+    for name, spans in found.items():
+        if len(spans) != 1:
+            raise InputError(
+                f"{file}: {name}: found {len(spans)} times: expected one number of "
+                "that name, `name: 0.2`, or its place among `name` and `score_weight`"
+            )
+    tuned = own_weights(reward)
+    for name, [(start, end)] in sorted(found.items(), key=lambda x: x[1], reverse=True):
+        number = _number(tuned[name][1])
+        # ROS takes no whole number where it has a list of others
+        number += "" if "." in number else ".0"
+        text = text[:start] + number + text[end:]
+    return text
+
+
+def terms_table(reward: Reward) -> str:
+    """Return the weights of own terms as lines: name, today, tuned, ratio."""
+    rows = own_weights(reward)
+    wide = max(len(name) for name in (*rows, "own term"))
+    lines = [f"{'own term':{wide}}  {'today':>10}  {'tuned':>10}"]
+    for name, (today, tuned) in rows.items():
+        times = f"x {tuned / today:.2f}"
+        lines.append(f"{name:{wide}}  {today:>10.4g}  {tuned:>10.4g}  {times}")
+    return "\n".join(lines)
 
 
 def _number(x: float) -> str:

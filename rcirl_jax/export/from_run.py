@@ -183,6 +183,8 @@ def write_weights(
     if config.sampler.own:
         named = {"place": config.sampler.own, "sha256": config.sampler.own_sha256}
         provenance = {**provenance, "own_sampler": named}
+    if features.own:
+        provenance = {**provenance, "own_terms": features.own.sha256}
     effective = effective_params(params, config.reward)
     kernels, biases = layers_of(effective["point"])
     weights = Reward(

@@ -22,7 +22,7 @@ from rcirl_jax.export.reader import (
     WeightsError,
     load_weights,
 )
-from rcirl_jax.features.mapping import FeatureMap, feature_map, known_presets
+from rcirl_jax.features.mapping import FeatureMap, feature_map
 from rcirl_jax.planner.own_cost import OwnCost, own_cost
 from rcirl_jax.reward import effective_model, value
 from rcirl_jax.reward.familiarity import Familiarity
@@ -35,7 +35,9 @@ Scorer = Callable[[np.ndarray, np.ndarray], np.ndarray]
 # types of the entries that are used; None stands for "not said"
 _SAID: dict[str, type] = {
     **dict.fromkeys(("seed", "steps"), int),
-    **dict.fromkeys(("git_commit", "dataset_sha256", "created", "mode"), str),
+    **dict.fromkeys(
+        ("git_commit", "dataset_sha256", "created", "mode", "own_terms"), str
+    ),
     **dict.fromkeys(("flags", "metrics", "versions", "config", "sweep"), dict),
     **dict.fromkeys(("own_cost", "own_sampler"), dict),
 }
@@ -63,13 +65,15 @@ def features_of(reward: Reward) -> FeatureMap:
     Raises:
       InputError: it computes others, with other units or at other times.
     """
-    known = known_presets()
-    if reward.preset not in known:
+    try:
+        features = feature_map(reward.preset)
+    except InputError as error:
+        raise InputError(f"{reward.file}: {error}") from error
+    if features.own and features.own.sha256 != reward.provenance.get("own_terms"):
         raise InputError(
-            f"{reward.file}: preset: {reward.preset}: "
-            f"expected one of {', '.join(known)}"
+            f"{reward.file}: own terms {reward.preset}: they are no longer those that "
+            "the weights were tuned for: expected the same file, or a new tuning"
         )
-    features = feature_map(reward.preset)
     try:
         reward.check_features(features.names, [s.unit for s in features.specs])
         check_times(reward)

@@ -2,7 +2,8 @@
 
 Which columns, in which order, with which units and caps, is read from
 data_specs/features/<preset>.toml; how a column is computed stands in
-`columns.py`. Human and sampled trajectories go through the same function.
+`columns.py`. A user's own terms (`terms.py`) are a preset by their place,
+FILE.py:NAME. Human and sampled trajectories go through the same function.
 """
 
 import dataclasses
@@ -25,9 +26,13 @@ from rcirl_jax.features.columns import (
     relate,
     slots,
 )
+from rcirl_jax.features.terms import OwnTerms, own_terms
 from rcirl_jax.runtime.specs import load_toml, spec_root
+from rcirl_jax.runtime.user_code import is_python
 from rcirl_jax.types import Candidates, Scene, Trajectory
 from rcirl_jax.units import TIMES_S
+
+UNBOUNDED = 1e30  # reach of features of which none is known
 
 
 def make_frame(scene: Scene, trajectory: Trajectory) -> Frame:
@@ -94,10 +99,14 @@ class FeatureMap:
     specs: tuple[FeatureSpec, ...]
     # safety terms: 1 the reward may not fall with it, -1 may not rise, 0 free
     signs: tuple[int, ...] = ()
+    # in the place of the package's columns
+    own: OwnTerms | None = None
 
     @property
     def context(self) -> tuple[int, ...]:
         """Per feature: 1 if all candidates of a scene share it at t = 0."""
+        if self.own:
+            return (0,) * self.num_features  # nothing is known of them
         return tuple(int(name not in OF_CANDIDATE_AT_START) for name in self.names)
 
     @property
@@ -115,8 +124,12 @@ class FeatureMap:
     ) -> Float[Array, "times features"]:
         """F of one trajectory in one scene, [T, F]; finite for finite inputs."""
         with jax.named_scope("features"):
-            frame = make_frame(scene, trajectory)
-            columns = [COLUMNS[spec.name](frame) for spec in self.specs]
+            if self.own:
+                one = jax.tree.map(lambda x: x[None], trajectory)
+                columns = [row[:, 0] for row in self.own.rows(scene, one)]
+            else:
+                frame = make_frame(scene, trajectory)
+                columns = [COLUMNS[spec.name](frame) for spec in self.specs]
             return jnp.stack(columns, axis=-1)
 
     def of_candidates(
@@ -132,12 +145,17 @@ class FeatureMap:
 
         The layout for speed: no [K, T, F] array is ever written.
         """
-        with jax.named_scope("features"):
-            return self.of_frames(candidate_frames(scene, candidates.trajectory))
+        return self.of_trajectories(scene, candidates.trajectory)
 
-    def of_frames(self, frames: Frame) -> tuple[jax.Array, ...]:
-        """F arrays of the frames' shape, from `candidate_frames`."""
-        return tuple(COLUMNS[spec.name](frames) for spec in self.specs)
+    def of_trajectories(
+        self, scene: Scene, trajectories: Trajectory, frames: Frame | None = None
+    ) -> tuple[Float[Array, "times candidates"], ...]:
+        """`rows` of K trajectories [K, T], with their `candidate_frames` if made."""
+        with jax.named_scope("features"):
+            if self.own:
+                return self.own.rows(scene, trajectories)
+            frames = frames or candidate_frames(scene, trajectories)
+            return tuple(COLUMNS[spec.name](frames) for spec in self.specs)
 
 
 def known_presets() -> list[str]:
@@ -147,14 +165,24 @@ def known_presets() -> list[str]:
 
 @functools.cache
 def feature_map(preset: str) -> FeatureMap:
-    """The feature map declared in data_specs/features/<preset>.toml.
+    """The feature map declared in data_specs/features/<preset>.toml, or own terms.
 
     Raises:
-      InputError: no such preset, an unknown column, or a value out of order.
+      InputError: no such preset, an unknown column, or a value out of order; own terms
+        that are none.
     """
+    if is_python(preset):
+        own = own_terms(preset)
+        about = {"unit": "1", "none": 0.0, "meaning": "an own term"}
+        reach = {"lower": -UNBOUNDED, "upper": UNBOUNDED}
+        specs = tuple(FeatureSpec(name=name, **about, **reach) for name in own.names)
+        return FeatureMap(preset, specs, own=own)
     known = known_presets()
     if preset not in known:
-        raise InputError(f"preset: {preset}: expected one of {', '.join(known)}")
+        raise InputError(
+            f"preset: {preset}: expected one of {', '.join(known)}, or FILE.py:NAME of "
+            "own terms"
+        )
     path = spec_root() / "features" / f"{preset}.toml"
     table = load_toml(path)
     rows, safety = table.get("feature", []), table.get("safety", {})

@@ -24,19 +24,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.errors import InputError, did_you_mean
-from rcirl_jax.planner.own_cost_process import python_cost
+from rcirl_jax.errors import InputError
+from rcirl_jax.features.terms import NOT_TRACEABLE
 from rcirl_jax.runtime.answering import AnsweringProcess, NoAnswer
+from rcirl_jax.runtime.user_code import is_python, loaded, python_file
 from rcirl_jax.types import Candidates, Scene
 
 CALL_S = 20.0  # s in which a process has to answer for a batch of scenes
 START_S = 60.0  # s in which it has to have loaded the cost
 LONGEST_NAME = 64  # characters, as weights files have it
-# what JAX raises where a function needs numbers
-NOT_TRACEABLE = (
-    jax.errors.ConcretizationTypeError,
-    jax.errors.TracerArrayConversionError,
-)
 EXPECTED = "expected costs [K] of (scene, candidates), lower is better"
 
 _failed: dict[str, str] = {}  # place -> line on why its process gave no costs
@@ -46,8 +42,8 @@ logging.getLogger("jax._src.callback").addFilter(lambda record: not _failed)
 
 def is_place(name: str) -> bool:
     """True for what names an own cost: FILE.py:FUNCTION or a library FILE.so."""
-    is_program = name.startswith("planner:")
-    return not is_program and (name.endswith(".so") or ".py:" in name)
+    is_library = name.endswith(".so") and not name.startswith("planner:")
+    return is_library or is_python(name)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -110,7 +106,7 @@ def own_cost(place: str) -> OwnCost:
     Raises:
       InputError: no such file or function, or a name that a baseline has.
     """
-    file = Path(place.partition(".py:")[0] + (".py" if ".py:" in place else ""))
+    file = python_file(place) if is_python(place) else Path(place)
     try:
         found = file.read_bytes()
     except OSError as error:
@@ -131,19 +127,7 @@ def own_cost(place: str) -> OwnCost:
 @functools.cache
 def _function(cost: OwnCost) -> Callable[[Scene, Candidates], Any]:
     """Loads the function of a Python file."""
-    try:
-        return python_cost(cost.place)
-    except Exception as error:
-        if isinstance(error, AttributeError) and error.name == cost.name:
-            known = [name for name in dir(error.obj) if not name.startswith("_")]
-            raise InputError(
-                f"{cost.place}: expected a function of that file"
-                + did_you_mean(cost.name, known)
-            ) from error
-        raise InputError(
-            f"{cost.place}: {type(error).__name__}: {error}: expected a file that "
-            "Python can import"
-        ) from error
+    return loaded(cost.place, "own cost")
 
 
 def words(cost: OwnCost) -> str:

@@ -8,7 +8,6 @@ once. What the cost prints goes to standard error.
 """
 
 import ctypes
-import importlib.util
 import os
 import struct
 import sys
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from rcirl_jax.runtime.answering import packed, unpacked
+from rcirl_jax.runtime.user_code import python_object
 from rcirl_jax.units import STATION_STEP_M, TIMES_S
 
 ABI = 1  # RCIRL_COST_ABI
@@ -116,17 +116,6 @@ def library_cost(path: str) -> Callable[[Any, Any], np.ndarray]:
     return cost
 
 
-def python_cost(place: str) -> Callable[[Any, Any], np.ndarray]:
-    """Makes the cost of a function in a Python file."""
-    stem, _, name = place.partition(".py:")
-    spec = importlib.util.spec_from_file_location("own_cost", stem + ".py")
-    if spec is None or spec.loader is None:
-        raise ValueError(f"{stem}.py: expected a Python file")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return getattr(module, name)
-
-
 def _node(arrays: Mapping[str, np.ndarray], number: int) -> types.SimpleNamespace:
     """One of a batch, with attributes for the parts of names."""
     root = types.SimpleNamespace()
@@ -151,7 +140,7 @@ def main() -> None:
         try:
             if cost is None:
                 is_library = place.endswith(".so")
-                cost = library_cost(place) if is_library else python_cost(place)
+                cost = library_cost(place) if is_library else python_object(place)
             count = len(given["candidates.feasible"]) if given else 0
             each = [_node(given, number) for number in range(count)]
             costs = [np.asarray(cost(x.scene, x.candidates), float) for x in each]

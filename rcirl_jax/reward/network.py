@@ -14,6 +14,7 @@ product, which takes a CPU a third of the time of [K, T, F]. The parameters are
     scene_gating  [F, F] C, if the scene sets the gates g
     offset        [] the discriminator's threshold, of the GAN loss only; ranks nothing
     log_beta      [] of V_total = beta own + V, where V is a residual on an own cost
+    log_scale     [] of weights of own terms, whose kernel is a logarithm too
 
 There is no output bias: it cancels between trajectories. Training changes raw
 parameters; `effective_params` are what V is made of, and what weights files hold.
@@ -47,7 +48,7 @@ ACTIVATIONS = {
     "identity": lambda x: x,
 }
 SCALE_CONSTRAINTS = ("unit", "none")
-CONSTRAINTS = ("none", "nonnegative", "monotone")
+CONSTRAINTS = ("none", "nonnegative", "monotone", "terms")
 GLOROT = jax.nn.initializers.glorot_uniform()
 
 
@@ -61,8 +62,11 @@ class RewardConfig:
     activation: str = "tanh"
     # "unit": output kernel and gamma have unit norm (see `effective_params`); "none"
     scale_constraint: str = "unit"
-    # "nonnegative": weights of costs, `hidden` must be (); "monotone": `signs`
+    # "nonnegative": weights of costs, `hidden` must be (); "monotone": `signs`;
+    # "terms": weights of own terms, from `today` on, `hidden` must be ()
     constraint: str = "none"
+    # per feature: weight > 0 with which an own term drives today
+    today: tuple[float, ...] = ()
     # per feature: 1 the reward may not fall with it, -1 may not rise, 0 free
     signs: tuple[int, ...] = ()
     # per feature: 1 if its value at t = 0 is part of the scene that sets the gates of
@@ -87,10 +91,14 @@ class RewardConfig:
             raise InputError(
                 f"constraint: {self.constraint}: expected one of {CONSTRAINTS}"
             )
-        if self.constraint == "nonnegative" and self.hidden:
+        if self.constraint in ("nonnegative", "terms") and self.hidden:
             raise InputError(
                 f"hidden: {self.hidden}: expected 0 under "
-                "constraint=nonnegative, which is linear in its costs"
+                f"constraint={self.constraint}, which is linear in its costs"
+            )
+        if self.constraint == "terms" and not self.today:
+            raise InputError(
+                "constraint: terms: expected own terms as features, FILE.py:NAME"
             )
         if self.constraint != "none" and self.module:
             raise InputError(
@@ -151,6 +159,8 @@ class RewardModel(nn.Module):
         }
         if config.scene_gating:
             raw["scene_gating"] = self.param("scene_gating", zeros, (count, count))
+        if config.constraint == "terms":
+            raw["log_scale"] = self.param("log_scale", zeros, ())
         params = effective_params(raw, config)
         # Sets follow one another along the points: a human between the candidates of
         # every time would break each row of the copy.
@@ -269,7 +279,10 @@ def effective_params(raw: RewardParams, config: RewardConfig) -> dict[str, Any]:
         # C without its rows of features that candidates do not share at t = 0
         shared = jnp.asarray(config.scene_gating, jnp.float32)[:, None]
         params["scene_gating"] = shared * params["scene_gating"]
-    if config.scale_constraint == "none" or config.constraint == "nonnegative":
+    if config.scale_constraint == "none" or config.constraint in (
+        "nonnegative",
+        "terms",
+    ):
         return params
     point = dict(params["point"])
     if config.module and "kernel" not in point.get("out", {}):
@@ -298,9 +311,21 @@ def _constrained(params: dict[str, Any], config: RewardConfig) -> dict[str, Any]
                  kernels and gamma are non-negative. With tanh, an odd function,
                  non-negative output weights leave one hidden layer as free as
                  before in the unsigned features.
+    terms        R = -sum_i w_i f_i,  w_i = scale today_i exp(theta_i): costs with the
+                 weights of today where theta = 0, to which weight decay pulls them;
+                 never negative. All times count alike, as in the planner. The scale
+                 is learned, or such that the mean of exp(theta) is 1.
     """
     if config.constraint == "none":
         return params
+    if config.constraint == "terms":
+        ratio = jnp.exp(params["point"]["out"]["kernel"][:, 0])
+        scale = jnp.exp(params.pop("log_scale"))
+        if config.scale_constraint == "unit":
+            scale = 1.0 / jnp.mean(ratio)
+        weights = scale * jnp.asarray(config.today, jnp.float32) * ratio
+        gamma = jnp.full_like(params["gamma"], 1.0 / params["gamma"].shape[0])
+        return {**params, "gamma": gamma, "point": point_of([-weights[:, None]], [])}
     gamma = jnp.abs(params["gamma"])
     kernels, biases = layers_of(params["point"])
     if config.constraint == "nonnegative":
@@ -322,7 +347,12 @@ def _unit(x: jax.Array) -> jax.Array:
 
 
 def _first(config: RewardConfig, key: jax.Array, count: int) -> RewardParams:
-    """First parameters of R_theta: Glorot uniform kernels, zero biases."""
+    """First parameters of R_theta: Glorot uniform kernels, zero biases.
+
+    Own terms begin with the weights of today.
+    """
+    if config.constraint == "terms":
+        return point_of([jnp.zeros((count, 1))], [])
     if config.module:
         x = jnp.zeros((2, NUM_TIMES, count))
         return dict(user_module(config.module).init(key, x)["params"])

@@ -7,11 +7,14 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap
+from rcirl_jax.features.mapping import UNBOUNDED
 from rcirl_jax.types import Normaliser
 
 SEEN_QUANTILES = (0.001, 0.999)  # what counts as seen in training
 VARYING_SHARE = 0.002  # of rows that have to differ from the median: one in 500
+TINY = 1e-12  # smallest scale of a feature without a declared range
 SCALE_FLOOR = 0.03  # share of a feature's declared range; the smallest scale
 
 
@@ -23,7 +26,9 @@ def normalise(
     return (clipped - normaliser.location) / normaliser.scale
 
 
-def fit_normaliser(features: np.ndarray, feature_map: FeatureMap) -> Normaliser:
+def fit_normaliser(
+    features: np.ndarray, feature_map: FeatureMap, today: Sequence[float] = ()
+) -> Normaliser:
     """Robust location and scale over rows [n, F] of the TRAINING split.
 
         location = median,  scale = (q95 - q05) / 2
@@ -35,13 +40,31 @@ def fit_normaliser(features: np.ndarray, feature_map: FeatureMap) -> Normaliser:
 
     A feature that does not vary (`varies`) has no effect by construction: its range
     is its median, so its normalised value is 0 everywhere and nothing untrained drives.
+
+    With `today`, the weights of own terms (see `RewardConfig.today`), all features
+    stay as they are but for one scale, the spread of today's cost.
     """
+    if today:
+        low, high = np.quantile(features.astype(np.float64) @ today, [0.05, 0.95])
+        if not high > low:
+            raise InputError(
+                f"{feature_map.preset}: today's cost is {low:g} nearly everywhere: "
+                "expected terms that tell trajectories apart"
+            )
+        whole = np.ones(len(today), np.float32)
+        return Normaliser(
+            lower=jnp.asarray(-UNBOUNDED * whole),
+            upper=jnp.asarray(UNBOUNDED * whole),
+            location=jnp.asarray(0.0 * whole),
+            scale=jnp.asarray(0.5 * (high - low) * whole, jnp.float32),
+        )
     lower = np.array([spec.lower for spec in feature_map.specs])
     upper = np.array([spec.upper for spec in feature_map.specs])
     rows = np.clip(np.asarray(features, np.float64), lower, upper)
     low, middle, high = np.quantile(rows, [0.05, 0.5, 0.95], axis=0)
     spread = np.maximum(0.5 * (high - low), rows.std(axis=0))
-    scale = np.maximum(spread, SCALE_FLOOR * (upper - lower))
+    reach = np.where(upper < UNBOUNDED, upper - lower, 0.0)
+    scale = np.maximum(spread, np.maximum(SCALE_FLOOR * reach, TINY))
     seen = varies(rows, middle)
     lower, upper = np.where(seen, lower, middle), np.where(seen, upper, middle)
     as_array = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731

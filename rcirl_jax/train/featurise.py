@@ -128,7 +128,9 @@ def featurise(
 
         all_trajectories = jax.tree.map(join, candidates.trajectory, driven)
         frames = candidate_frames(demonstration.scene, all_trajectories)
-        both = jnp.stack(features.of_frames(frames))
+        both = jnp.stack(
+            features.of_trajectories(demonstration.scene, all_trajectories, frames)
+        )
         human, rows = both[:, :, sampled].T, both[:, :, :sampled]
         frames = jax.tree.map(lambda x: x[:, :sampled], frames)
 

@@ -195,7 +195,8 @@ def _train(
         print(line, file=sys.stderr)
     if checkpoints.latest_step is None:
         rows = normaliser_rows(dataset, config)
-        normaliser = fit_normaliser(rows, feature_map(config.features))
+        features, today = feature_map(config.features), config.reward.today
+        normaliser = fit_normaliser(rows, features, today)
         state = parallel.replicate(init_state(config, normaliser))
     else:
         like = parallel.replicate(blank_state(config))

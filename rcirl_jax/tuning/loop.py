@@ -20,6 +20,7 @@ from rcirl_jax.errors import InputError, extra_of
 from rcirl_jax.evaluation.gate.types import CANDIDATE, Verdict
 from rcirl_jax.evaluation.gate.words import WIDTH
 from rcirl_jax.export.closed_loop import SuiteJob, checked_sampler
+from rcirl_jax.export.forms import terms_table
 from rcirl_jax.export.loading import open_reward, prior_cost_words
 from rcirl_jax.planner import own_cost
 from rcirl_jax.runtime.compiling import compiles
@@ -196,8 +197,13 @@ def _check_incumbent(run: Run) -> None:
 
 
 def _said_of_weights(run: Run) -> str:
-    """Says which features never vary in training, and a prior cost's gains."""
+    """Says which features never vary in training, and a prior cost's gains.
+
+    Of own terms, the tuned weights.
+    """
     reward = open_reward(str(run.weights))
+    if run.config.train.reward.today:
+        return terms_table(reward)
     silent = "features without effect, for they never vary in the training data: "
     silent += ", ".join(reward.unsupported) or "none"
     prior = prior_cost_words(CANDIDATE, reward)

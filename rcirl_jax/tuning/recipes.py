@@ -3,6 +3,7 @@
     data_specs/recipes/tuned.toml   the default
     data_specs/recipes/paper.toml   the paper's own setting
     data_specs/recipes/quick.toml   for the demo
+    data_specs/recipes/terms.toml   the weights of own terms (`features.terms`)
 
 [train] are fields of `TrainConfig`, [train.reward] of `RewardConfig` (`scene_gating`
 stands for the preset's context columns), [train.sampler] of `SamplerConfig`, [collect]
@@ -28,11 +29,14 @@ from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.state import TrainConfig
 
 DEFAULT = "tuned"
+TERMS = "terms"  # of own terms
 SIMULATED = "simulated_demonstrations"
 TABLES = ("about", "train", "collect", SIMULATED, "prior_cost", "autotune")
 # of a run, not of a recipe
 NOT_OF_A_RECIPE = ("seed", "reward", "sampler")
-PRESETS_OWN = ("scene_gating", "signs")  # of a reward, what its feature preset says
+# of a reward, what its feature preset says
+PRESETS_OWN = ("scene_gating", "signs", "today")
+OWN_TERMS = "own terms"  # as features of a recipe: the user's, by --terms
 # own cost: the incumbent where it is one, else the hand-set cost
 EXPERTS = ("none", "driver model", "own cost", "incumbent")
 SUITE_SEED = 0  # of the catalogue that rewards are judged on
@@ -166,7 +170,11 @@ def load_recipe(name: str) -> Recipe:
     features = settings.get("features", "paper21")
     with _inside(path, "train.reward") as where:
         of_reward = typed_fields(RewardConfig, network, where, PRESETS_OWN)
-        reward = reward_config(features, of_reward, scene_gating)
+        if features == OWN_TERMS:  # not known yet
+            of_reward["today"] = (1.0,)
+            reward = RewardConfig(**of_reward)
+        else:
+            reward = reward_config(features, of_reward, scene_gating)
     with _inside(path, "train.sampler") as where:
         sampler = SamplerConfig(**typed_fields(SamplerConfig, sampler, where))
     with _inside(path, "train"):
@@ -236,12 +244,15 @@ def reward_config(
     features: str, settings: Mapping[str, Any], scene_gating: bool
 ) -> RewardConfig:
     """The network with the preset's context and signs where they are asked for."""
-    preset = feature_map(features)
-    monotone = settings.get("constraint") == "monotone"
+    if features == OWN_TERMS:
+        raise InputError("terms: not given: expected FILE.py:NAME of your own terms")
+    preset, constraint = feature_map(features), settings.get("constraint")
+    weights = preset.own.weights if preset.own else ()
     return RewardConfig(
         **settings,
         scene_gating=preset.context if scene_gating else (),
-        signs=preset.signs if monotone else (),
+        signs=preset.signs if constraint == "monotone" else (),
+        today=weights if constraint == "terms" else (),
     )
 
 

@@ -8,6 +8,8 @@ RUN/train-KEY/seed-N/  training runs; KEY changes with what they are made from
 RUN/seeds/N.msgpack    every seed's reward
 RUN/weights.msgpack    the candidate: of the seeds the one with the median share of
                        training pairs won
+RUN/today.msgpack      own terms with the weights that drive today
+RUN/terms.yaml         own terms with the tuned weights, beside today's
 RUN/tuned_idm.json     the driver model tuned on the training scenes, a baseline
 RUN/ranking.json       held-out scenes as the planner sees them, beside baselines
 RUN/ranking_recorded.json   the same with recorded futures
@@ -51,6 +53,7 @@ STALE = {
     **dict.fromkeys(("export", "simulate", "likeness"), ("gate", "dial", "report")),
     **dict.fromkeys(("rank", "gate", "dial"), ("report",)),
 }
+TODAY, TERMS = "today.msgpack", "terms.yaml"
 NOTED = ("git_commit", "code_sha256", "versions", "flags")  # of every stage
 
 
@@ -122,6 +125,16 @@ class Run:
     def weights(self) -> Path:
         """The candidate."""
         return self.folder / "weights.msgpack"
+
+    @property
+    def today(self) -> Path:
+        """Own terms with the weights that drive today."""
+        return self.folder / TODAY
+
+    @property
+    def terms(self) -> Path:
+        """Own terms with the tuned weights."""
+        return self.folder / TERMS
 
     @property
     def metrics(self) -> Path:

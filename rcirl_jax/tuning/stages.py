@@ -40,6 +40,7 @@ from rcirl_jax.export.closed_loop import (
     suite_facts,
     write_tuned_idm,
 )
+from rcirl_jax.export.forms import terms_yaml
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.loading import open_reward, scorer_of
 from rcirl_jax.export.sweep import SWEEP, read_sweep
@@ -95,9 +96,12 @@ def train_seeds(run: Run, dataset: Demonstrations, sources: Sequence[Dataset]) -
         ranked = sorted(range(run.config.seeds), key=won)
         median = files[ranked[(len(ranked) - 1) // 2]]
         write_whole(run.weights, median.read_bytes())
+        if run.config.train.reward.today:
+            write_whole(run.terms, terms_yaml(open_reward(str(run.weights))))
 
     hashes = [file_sha256(file) for file in files]
-    run.stage("export", {"seeds": hashes}, [run.weights], choose)
+    made = [run.weights, *([run.terms] if run.config.train.reward.today else [])]
+    run.stage("export", {"seeds": hashes}, made, choose)
 
 
 def train_one(

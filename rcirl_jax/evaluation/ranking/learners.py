@@ -183,7 +183,8 @@ def normaliser_of(
     An infinite scale turns a feature into 0 for the network.
     """
     features = feature_map(config.features)
-    made = fit_normaliser(fitting_rows(frozen, config), features)
+    rows = fitting_rows(frozen, config)
+    made = fit_normaliser(rows, features, config.reward.today)
     if keep is None:
         return made
     kept = jnp.asarray([name in keep for name in features.names])
