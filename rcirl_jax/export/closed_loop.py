@@ -490,7 +490,7 @@ def write_today(path: Path, train: TrainConfig) -> Reward:
         "mode": train.sampler.mode,
         "metrics": {},
     }
-    return write_weights(
+    write_weights(
         path,
         init_params(jax.random.key(0), features.num_features, train.reward),
         normaliser,
@@ -499,6 +499,7 @@ def write_today(path: Path, train: TrainConfig) -> Reward:
         provenance,
         seen_range(rows, features),
     )
+    return open_reward(str(path))
 
 
 @functools.cache

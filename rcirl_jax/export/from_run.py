@@ -11,7 +11,7 @@ import numpy as np
 
 from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.errors import MALFORMED, InputError
-from rcirl_jax.export.reader import FAMILIARITY, PriorCost, Reward
+from rcirl_jax.export.reader import FAMILIARITY, MAX_NAME, PriorCost, Reward
 from rcirl_jax.export.weights import save
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.own_cost import OwnCost, is_place, own_cost
@@ -183,12 +183,15 @@ def write_weights(
     if config.sampler.own:
         named = {"place": config.sampler.own, "sha256": config.sampler.own_sha256}
         provenance = {**provenance, "own_sampler": named}
-    if features.own:
-        provenance = {**provenance, "own_terms": features.own.sha256}
+    preset = config.features
+    if own := features.own:
+        named = {"place": os.path.abspath(own.place), "sha256": own.sha256}
+        provenance = {**provenance, "own_terms": named}
+        preset = os.path.basename(own.place)[-MAX_NAME:]
     effective = effective_params(params, config.reward)
     kernels, biases = layers_of(effective["point"])
     weights = Reward(
-        preset=config.features,
+        preset=preset,
         names=features.names,
         units=tuple(spec.unit for spec in features.specs),
         none_values=tuple(spec.none for spec in features.specs),

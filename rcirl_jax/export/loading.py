@@ -1,5 +1,6 @@
 """Weights files -> scorers, with the features and sampler they were made for."""
 
+import dataclasses
 import functools
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -35,11 +36,9 @@ Scorer = Callable[[np.ndarray, np.ndarray], np.ndarray]
 # types of the entries that are used; None stands for "not said"
 _SAID: dict[str, type] = {
     **dict.fromkeys(("seed", "steps"), int),
-    **dict.fromkeys(
-        ("git_commit", "dataset_sha256", "created", "mode", "own_terms"), str
-    ),
+    **dict.fromkeys(("git_commit", "dataset_sha256", "created", "mode"), str),
     **dict.fromkeys(("flags", "metrics", "versions", "config", "sweep"), dict),
-    **dict.fromkeys(("own_cost", "own_sampler"), dict),
+    **dict.fromkeys(("own_cost", "own_sampler", "own_terms"), dict),
 }
 
 
@@ -54,8 +53,11 @@ def open_reward(path: str) -> Reward:
         reward = load_weights(path)
     except WeightsError as error:
         raise InputError(str(error)) from error
-    features_of(reward)
     check_provenance(reward.provenance, reward.file)
+    if named := reward.provenance.get("own_terms"):
+        # the file's own name of them is too short for a place
+        reward = dataclasses.replace(reward, preset=str(named.get("place")))
+    features_of(reward)
     return reward
 
 
@@ -69,7 +71,8 @@ def features_of(reward: Reward) -> FeatureMap:
         features = feature_map(reward.preset)
     except InputError as error:
         raise InputError(f"{reward.file}: {error}") from error
-    if features.own and features.own.sha256 != reward.provenance.get("own_terms"):
+    named = reward.provenance.get("own_terms") or {}
+    if features.own and features.own.sha256 != named.get("sha256"):
         raise InputError(
             f"{reward.file}: own terms {reward.preset}: they are no longer those that "
             "the weights were tuned for: expected the same file, or a new tuning"

@@ -173,9 +173,17 @@ def feature_map(preset: str) -> FeatureMap:
     """
     if is_python(preset):
         own = own_terms(preset)
-        about = {"unit": "1", "none": 0.0, "meaning": "an own term"}
-        reach = {"lower": -UNBOUNDED, "upper": UNBOUNDED}
-        specs = tuple(FeatureSpec(name=name, **about, **reach) for name in own.names)
+        specs = tuple(
+            FeatureSpec(
+                name=name,
+                unit="1",
+                none=0.0,
+                lower=-UNBOUNDED,
+                upper=UNBOUNDED,
+                meaning="an own term",
+            )
+            for name in own.names
+        )
         return FeatureMap(preset, specs, own=own)
     known = known_presets()
     if preset not in known:

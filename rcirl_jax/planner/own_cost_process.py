@@ -134,13 +134,13 @@ def main() -> None:
     """Answers until standard input ends."""
     place, answers = sys.argv[1], os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    cost: Callable[[Any, Any], np.ndarray] | None = None
+    cost: Any = None
     while head := sys.stdin.buffer.read(8):
         given = unpacked(sys.stdin.buffer.read(*struct.unpack("<Q", head)))
         try:
             if cost is None:
                 is_library = place.endswith(".so")
-                cost = library_cost(place) if is_library else python_object(place)
+                cost = (library_cost if is_library else python_object)(place)
             count = len(given["candidates.feasible"]) if given else 0
             each = [_node(given, number) for number in range(count)]
             costs = [np.asarray(cost(x.scene, x.candidates), float) for x in each]
