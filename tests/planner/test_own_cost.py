@@ -113,7 +113,7 @@ def test_what_is_no_cost_is_one_line(name, line, some, monkeypatch):
     ("given", "line"),
     [
         ("nowhere.py:f", r"nowhere.py:f: No such file"),
-        (place("headway_cots"), r"headway_cots: expected a function .* headway_cost"),
+        (place("headway_cots"), r"headway_cots: expected a name .* headway_cost"),
     ],
 )
 def test_what_is_not_there_is_one_line(given, line):

@@ -21,7 +21,7 @@ def write(tmp_path, text):
 
 
 def test_the_recipes_say_what_decides_a_run():
-    assert recipe_names() == ["paper", "quick", "residual", "tuned"]
+    assert recipe_names() == ["paper", "quick", "residual", "terms", "tuned"]
     needed = {"loss", "positive", "futures", "admissible_in", "epochs", "learning_rate"}
     for name in recipe_names():
         body = load_toml(spec_root() / "recipes" / f"{name}.toml")
