@@ -32,7 +32,8 @@ from rcirl_jax.evaluation.ranking.report import (
     format_table,
 )
 from rcirl_jax.evaluation.statistics import CONFIDENCE
-from rcirl_jax.export.loading import own_sampler_of
+from rcirl_jax.export.forms import own_weights
+from rcirl_jax.export.loading import features_of, own_sampler_of
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.sweep import table as sweep_table
 from rcirl_jax.report.charts import (
@@ -62,6 +63,7 @@ from rcirl_jax.simulation.metrics import COLUMNS
 NUM_FRAMES = 2  # example scenes
 CONTENTS = (
     ("verdict", "Verdict"),
+    ("own_terms", "The weights of your own terms"),
     ("cases", "Cases"),
     ("likeness", "Nearer to the human"),
     ("dial", "How strongly the learned value counts"),
@@ -127,10 +129,11 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
     suite, workdir = summarise(report.suite), report.workdir
     reward = next(iter(report.rewards.values()))
     sampler = own_sampler_of([reward], SamplerConfig(mode=reward.mode))
-    quality = ""
+    hidden, quality = len(reward.kernels) > 1, ""
     if isinstance(report.dataset, Dataset):
         quality = format_quality(report.dataset.manifest.quality)
-    without = {"training": not workdir, "dial": not report.dial}
+    own = own_weights(reward) if features_of(reward).own and not hidden else {}
+    without = {"training": not workdir, "dial": not report.dial, "own_terms": not own}
     shown = [entry for entry in CONTENTS if not without.get(entry[0])]
     margins = [
         (name.replace("_", " "), f"{100.0 * value:g} %")
@@ -138,6 +141,14 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
     ]
     verdict, rows = report.verdict, (next(iter(suite.rows)), report.incumbent)
     sections: dict[str, Callable[[], object]] = {
+        "own_terms": lambda: Table(
+            caption="Only the ratios of weights decide; their geometric mean is kept",
+            heads=("own term", "today", "tuned", "times"),
+            rows=[
+                (name, f"{was:.4g}", f"{now:.4g}", number(now / was, 2))
+                for name, (was, now) in own.items()
+            ],
+        ),
         "cards": lambda: cards(verdict, suite, report.incumbent),
         "cases": lambda: case_lines(report.suite, report.incumbent, report.replays),
         "replays": lambda: player_data(report.replays),
