@@ -47,7 +47,7 @@ from rcirl_jax.runtime.atomic_files import write_json, write_whole
 
 USUAL = (
     *("run", "weights", "output", "dial", "data", "onnx", "stablehlo", "jax_export"),
-    "yaml",
+    *("yaml", "into"),
 )
 _RUN = flags.DEFINE_string("run", None, "run to export: a folder of `rcirl train`")
 _WEIGHTS = flags.DEFINE_string(
@@ -94,13 +94,13 @@ def main() -> None:
         raise InputError("--run, --weights: expected one of them")
     files = {x.name: Path(x.value) for x in (_STABLEHLO, _JAX, _ONNX, _YAML) if x.value}
     if _DIAL.value is not None:
-        if not _WEIGHTS.value or not _OUTPUT.value or files:
+        if _INTO.value or not _WEIGHTS.value or not _OUTPUT.value or files:
             raise InputError("--dial: expected --weights and --output with it, no more")
         made = save_with_dial(_WEIGHTS.value, _DIAL.value, _OUTPUT.value)
         print(f"{_OUTPUT.value}: {made.prior_cost}, sha256 {made.sha256[:16]}...")
     elif _INTO.value:
-        if not _WEIGHTS.value or not _OUTPUT.value:
-            raise InputError("--into: expected with --weights and --output")
+        if not _WEIGHTS.value or not _OUTPUT.value or files:
+            raise InputError("--into: expected --weights and --output with it, no more")
         theirs, output = Path(_INTO.value), Path(_OUTPUT.value)
         try:
             text = theirs.read_text("utf-8")

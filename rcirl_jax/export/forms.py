@@ -321,7 +321,8 @@ def with_weights(text: str, reward: Reward, file: str) -> str:
     Raises:
       InputError: a term is not there, or more than once.
     """
-    found: dict[str, list[tuple[int, int]]] = {name: [] for name in own_weights(reward)}
+    tuned = own_weights(reward)
+    found: dict[str, list[tuple[int, int]]] = {name: [] for name in tuned}
     for name, spans in found.items():
         line = rf"^[ \t]*(?:- )?[\"']?{re.escape(name)}[\"']?[ \t]*[:=][ \t]*({NUMBER})"
         spans += [one.span(1) for one in re.finditer(line, text, re.MULTILINE)]
@@ -344,7 +345,6 @@ def with_weights(text: str, reward: Reward, file: str) -> str:
                 f"{file}: {name}: found {len(spans)} times: expected one number of "
                 "that name, `name: 0.2`, or its place among `name` and `score_weight`"
             )
-    tuned = own_weights(reward)
     for name, [(start, end)] in sorted(found.items(), key=lambda x: x[1], reverse=True):
         number = _number(tuned[name][1])
         # ROS takes no whole number where it has a list of others

@@ -13,7 +13,6 @@ slower.
 
 import dataclasses
 import functools
-import hashlib
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -23,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.user_code import is_python, loaded, python_file
+from rcirl_jax.runtime.user_code import loaded, python_sha256
 from rcirl_jax.types import Scene, Trajectory
 from rcirl_jax.units import NUM_TIMES
 
@@ -77,7 +76,7 @@ class OwnTerms:
     def _columns(self, scene: Any, trajectory: Any, xp: Any = jnp) -> list:  # noqa: ANN401
         """Computes the terms [T] of one trajectory, by jax.numpy or numpy."""
         columns = []
-        for name, term in _terms(self.place).items():
+        for name, (term, _) in _terms(self.place).items():
             try:
                 made = xp.asarray(term(scene, trajectory), xp.float32)
             except NOT_TRACEABLE:
@@ -126,26 +125,14 @@ def own_terms(place: str) -> OwnTerms:
       InputError: no such file or name; what is there are no terms; a weight that is not
         above 0.
     """
-    found, sizes = _terms(place), {}
-    for name, (_, weight) in _given(place).items():
-        if not isinstance(weight, int | float) or not 0.0 < weight < math.inf:
-            raise InputError(
-                f"{place}: {name}: weight {weight}: expected a number above 0, as the "
-                "planner drives today; of a new term a small one"
-            )
-        sizes[name] = float(weight)
-    return OwnTerms(
-        place=place,
-        sha256=hashlib.sha256(python_file(place).read_bytes()).hexdigest(),
-        names=tuple(found),
-        weights=tuple(sizes.values()),
-    )
+    sha256, terms = python_sha256(place, "terms"), _terms(place)
+    weights = tuple(float(weight) for _, weight in terms.values())
+    return OwnTerms(place=place, sha256=sha256, names=tuple(terms), weights=weights)
 
 
-def _given(place: str) -> Mapping[str, tuple[Term, Any]]:
+@functools.cache
+def _terms(place: str) -> Mapping[str, tuple[Term, float]]:
     """Loads {name: (term, weight)}."""
-    if not is_python(place):
-        raise InputError(f"terms: {place}: expected FILE.py:NAME")
     found = loaded(place, "own terms")
     if not isinstance(found, Mapping) or not 0 < len(found) <= MOST:
         raise InputError(f"{place}: {type(found).__name__}: {EXPECTED}, 1 to {MOST}")
@@ -153,10 +140,10 @@ def _given(place: str) -> Mapping[str, tuple[Term, Any]]:
         fits = isinstance(pair, tuple) and len(pair) == 2 and callable(pair[0])
         if not isinstance(name, str) or not 0 < len(name) <= LONGEST_NAME or not fits:
             raise InputError(f"{place}: {name}: {pair}: {EXPECTED}")
+        weight = pair[1]
+        if not isinstance(weight, int | float) or not 0.0 < weight < math.inf:
+            raise InputError(
+                f"{place}: {name}: weight {weight}: expected a number above 0, as the "
+                "planner drives today; of a new term a small one"
+            )
     return found
-
-
-@functools.cache
-def _terms(place: str) -> dict[str, Term]:
-    """Loads the functions by name."""
-    return {name: term for name, (term, _) in _given(place).items()}

@@ -3,6 +3,7 @@
 Knows nothing of JAX, so that processes that need it start at once.
 """
 
+import hashlib
 import importlib.util
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,22 @@ def is_python(place: str) -> bool:
 def python_file(place: str) -> Path:
     """Returns the file of a place."""
     return Path(place.partition(".py:")[0] + ".py")
+
+
+def python_sha256(place: str, what: str) -> str:
+    """Returns the sha256 of the file of a place.
+
+    Raises:
+      InputError: no such file, or no FILE.py:NAME; `what` it is begins the line.
+    """
+    if not is_python(place):
+        raise InputError(f"{what}: {place}: expected FILE.py:NAME")
+    try:
+        return hashlib.sha256(python_file(place).read_bytes()).hexdigest()
+    except OSError as error:
+        raise InputError(
+            f"{what}: {place}: {error.strerror}: expected FILE.py:NAME"
+        ) from error
 
 
 def python_object(place: str) -> Any:  # noqa: ANN401

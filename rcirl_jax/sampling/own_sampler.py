@@ -9,7 +9,6 @@ all scenes. What they are driven with beside these, and derivatives, are `sample
 
 import dataclasses
 import functools
-import hashlib
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.user_code import is_python, loaded, python_file
+from rcirl_jax.runtime.user_code import loaded, python_sha256
 from rcirl_jax.types import Candidates, Ego, Obstacles, Path, Scene, Tag
 from rcirl_jax.units import NUM_OBSTACLES, NUM_STATIONS, NUM_TIMES
 
@@ -29,25 +28,9 @@ APART_M = 0.5  # m between the ends of candidates that are told apart
 EXPECTED = f"expected s, l [K, {NUM_TIMES}] m of (scene, key)"
 
 
-def file_sha256(place: str) -> str:
-    """Sha256 of the file of FILE.py:FUNCTION.
-
-    Raises:
-      InputError: no such file.
-    """
-    if not is_python(place):
-        raise InputError(f"sampler: {place}: expected FILE.py:FUNCTION")
-    try:
-        return hashlib.sha256(python_file(place).read_bytes()).hexdigest()
-    except OSError as error:
-        raise InputError(
-            f"sampler: {place}: {error.strerror}: expected FILE.py:FUNCTION"
-        ) from error
-
-
 @functools.cache
 def _function(place: str, sha256: str) -> Callable[[Scene, jax.Array], Any]:
-    if file_sha256(place) != sha256:
+    if python_sha256(place, "sampler") != sha256:
         raise InputError(
             f"sampler: {place}: it is no longer the one that was trained with: "
             "expected the same file, or a new training"
@@ -132,7 +115,7 @@ def check_own_sampler(
     Raises:
       InputError: one of these does not hold; names the scene, the candidate, the value.
     """
-    sha256 = file_sha256(place)
+    sha256 = python_sha256(place, "sampler")
     ask = jax.jit(jax.vmap(functools.partial(own_positions, place, sha256)))
     first, again = (jax.tree.map(np.asarray, ask(scenes, keys)) for _ in range(2))
     ego = scenes.ego

@@ -21,6 +21,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.features.columns import SLOPE_POINTS, driven_curvature, table_slope
 from rcirl_jax.geometry.frenet import lookup
 from rcirl_jax.geometry.polynomial import evaluate, quartic, quintic
+from rcirl_jax.runtime.user_code import python_sha256
 from rcirl_jax.sampling.kinematics import (
     remaining_min,
     running_max,
@@ -29,7 +30,6 @@ from rcirl_jax.sampling.kinematics import (
 )
 from rcirl_jax.sampling.own_sampler import (
     START_M,
-    file_sha256,
     own_count,
     own_positions,
 )
@@ -116,7 +116,7 @@ class SamplerConfig:
         if self.mode not in MODES:
             raise InputError(f"mode: {self.mode}: expected one of {MODES}")
         if self.own and not self.own_sha256:
-            object.__setattr__(self, "own_sha256", file_sha256(self.own))
+            object.__setattr__(self, "own_sha256", python_sha256(self.own, "sampler"))
 
     def on_own(self, base: "SamplerConfig") -> "SamplerConfig":
         """Returns another grid, with own candidates in its place if there are any."""

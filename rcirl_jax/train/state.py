@@ -23,6 +23,7 @@ from rcirl_jax.reward import (
     RewardConfig,
     RewardParams,
 )
+from rcirl_jax.runtime.user_code import is_python, python_sha256
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Demonstration
 
@@ -85,8 +86,10 @@ RANGES: dict[str, tuple[float, float, str]] = {
 class TrainConfig:
     """Everything that decides the result of training; hashable, in provenance."""
 
-    # feature preset, data_specs/features/<name>.toml
+    # feature preset, data_specs/features/<name>.toml, or FILE.py:NAME of own terms
     features: str = "paper21"
+    # sha256 of the file of own terms
+    terms_sha256: str = ""
     # key of reward.LOSSES
     loss: str = "rank"
     # a of the rank loss (the paper: 0.05)
@@ -140,6 +143,14 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         """Reject values out of range."""
+        if is_python(self.features):
+            found = python_sha256(self.features, "terms")
+            if self.terms_sha256 not in ("", found):
+                raise InputError(
+                    f"terms: {self.features}: they have changed since the training: "
+                    "expected the same file, or a new training"
+                )
+            object.__setattr__(self, "terms_sha256", found)
         known = {"loss": LOSSES, "optimizer": OPTIMIZERS, "positive": POSITIVES}
         known |= {"futures": LEARNED_FUTURES, "admissible_in": ADMISSIBLE_IN}
         for name, values in known.items():
@@ -177,6 +188,7 @@ class TrainConfig:
         """Returns what decides candidates and features; the rest at its default."""
         return TrainConfig(
             features=self.features,
+            terms_sha256=self.terms_sha256,
             # the only loss that asks for densities
             loss="listwise" if self.loss == "listwise" else "rank",
             positive=self.positive,

@@ -33,7 +33,7 @@ TERMS = "terms"  # of own terms
 SIMULATED = "simulated_demonstrations"
 TABLES = ("about", "train", "collect", SIMULATED, "prior_cost", "autotune")
 # of a run, not of a recipe
-NOT_OF_A_RECIPE = ("seed", "reward", "sampler")
+NOT_OF_A_RECIPE = ("terms_sha256", "seed", "reward", "sampler")
 # of a reward, what its feature preset says
 PRESETS_OWN = ("scene_gating", "signs", "today")
 OWN_TERMS = "own terms"  # as features of a recipe: the user's, by --terms
@@ -284,4 +284,5 @@ def override(
         settings,
         bool(base.reward.scene_gating) if scene_gating is None else scene_gating,
     )
-    return dataclasses.replace(base, **rest, seed=seed, reward=reward)
+    other = {"terms_sha256": ""} if "features" in rest else {}
+    return dataclasses.replace(base, **rest, **other, seed=seed, reward=reward)

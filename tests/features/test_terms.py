@@ -186,3 +186,15 @@ def test_without_terms_the_recipe_is_refused():
         override(load_recipe("terms").train, {})
     with pytest.raises(InputError, match="expected own terms as features"):
         RewardConfig(hidden=(), constraint="terms")
+
+
+def test_terms_that_change_are_another_training(tmp_path):
+    place = terms_file(tmp_path)
+    before = override(load_recipe("terms").train, {"features": place})
+    key = before.for_features
+    terms_file(tmp_path, TRACED.replace("x.j ** 2", "x.a ** 2"))
+    after = override(load_recipe("terms").train, {"features": place})
+    assert before.terms_sha256 != after.terms_sha256
+    assert key != after.for_features
+    with pytest.raises(InputError, match="have changed since the training"):
+        dataclasses.replace(before, epochs=1)

@@ -34,32 +34,19 @@ class Measure:
     unit: str
     digits: int
     better: str  # higher or lower
-    is_rate: bool = False  # share of cases, with its exact interval
+    is_rate: bool  # share of cases, with its exact interval
 
 
 MEASURES = {
-    "nuplan": Measure(title="nuPlan", unit="points", digits=1, better="higher"),
-    "progress": Measure(
-        title="progress", unit="% of the own cost's", digits=1, better="higher"
-    ),
-    "no_fault": Measure(
-        title="no at-fault collision",
-        unit="% of cases",
-        digits=1,
-        better="higher",
-        is_rate=True,
-    ),
-    "jerk": Measure(
-        title="|jerk| < 6 m/s³ throughout",
-        unit="% of cases",
-        digits=1,
-        better="higher",
-        is_rate=True,
-    ),
-    "rms_jerk": Measure(title="RMS jerk", unit="m/s³", digits=2, better="lower"),
-    "distance": Measure(
-        title="distance to the human", unit="m", digits=2, better="lower"
-    ),
+    name: Measure(title=title, unit=unit, digits=digits, better=better, is_rate=is_rate)
+    for name, title, unit, digits, better, is_rate in (
+        ("nuplan", "nuPlan", "points", 1, "higher", False),
+        ("progress", "progress", "% of the own cost's", 1, "higher", False),
+        ("no_fault", "no at-fault collision", "% of cases", 1, "higher", True),
+        ("jerk", "|jerk| < 6 m/s³ throughout", "% of cases", 1, "higher", True),
+        ("rms_jerk", "RMS jerk", "m/s³", 2, "lower", False),
+        ("distance", "distance to the human", "m", 2, "lower", False),
+    )
 }
 
 
