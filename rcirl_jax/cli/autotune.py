@@ -24,7 +24,7 @@ from rcirl_jax.data.formats import IMPORTERS
 from rcirl_jax.data.formats.recognise import recognised_format
 from rcirl_jax.data.importing import ImportConfig, Logs
 from rcirl_jax.errors import InputError, did_you_mean
-from rcirl_jax.export.closed_loop import write_today
+from rcirl_jax.export.closed_loop import write_own_terms
 from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.train.loop import Running
 from rcirl_jax.train.parallel import PARALLEL, share_cores
@@ -93,7 +93,7 @@ def main() -> None:
     given, one = sources(), made_run(Path(_OUTPUT.value))
     with only_one(one.folder):
         if one.config.incumbent == str(one.today):
-            write_today(one.today, one.config.train)
+            write_own_terms(one.today, one.config.train)
         tune(one, given, _UNTIL.value)
 
 

@@ -7,6 +7,7 @@ looked at) as a learner's training has. Rows:
     hand-set, tuned        eight weights, as many queries as a learner's training
     hand-set, tuned long   the same with a stated number of evaluations
     IDM, tuned             five parameters, as many queries as a learner's training
+    own terms, by search   the weights of a user's own terms, at least as many queries
 
 A vector of zeros is the usual baseline. Sources of the searches: Hansen, The CMA
 Evolution Strategy: A Tutorial (arXiv:1604.00772), by the package `cma`, with restarts
@@ -33,6 +34,7 @@ from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.errors import InputError, extra_module
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, covered_rows
 from rcirl_jax.evaluation.ranking.score import Baseline, chunks, horizon_mask, measured
+from rcirl_jax.features.terms import OwnTerms
 from rcirl_jax.planner.baselines import (
     TUNED_IDM_ROW,
     Idm,
@@ -64,7 +66,9 @@ POPULATION_CHUNK = 8  # vectors per device call; padded, so that it compiles onc
 
 # What a tuner may change of the driver model, in the order of its vector.
 TUNABLE_IDM = ("headway", "standstill_gap", "acceleration", "braking", "speed_share")
+TERMS_ROW = "own terms, by search"  # name of its row in all tables
 LARGEST_IDM_LOG = 3.0  # a parameter is within a factor exp(3) = 20 of the usual one
+LARGEST_TERM_LOG = 10.0  # a weight of an own term within exp(10) = 22,000 of today's
 
 Objective = Callable[[np.ndarray], np.ndarray]  # vectors [n, d] -> [n], low is good
 # yields vectors [n, d] that are to be evaluated, and is sent their values [n]
@@ -193,7 +197,7 @@ class Tunable:
     """A kind of baseline: its parameters, and how it values candidates."""
 
     names: tuple[str, ...]  # of the parameters, in the order of a vector
-    baseline: Callable[[jax.Array], Baseline]  # of a vector [d], which may be traced
+    baseline: Callable[[jax.Array], Any]  # of a vector [d], which may be traced
     # (scene, candidates [K, T], mask [T]) -> what the values need
     known: Callable[[Scene, Trajectory, jax.Array], Any]
     # (that, a baseline, whether candidates keep to the path) -> [K], higher is better
@@ -237,6 +241,32 @@ DRIVER = Tunable(
     known=lambda *known: known,
     values=_nearness,
 )
+
+
+@functools.cache
+def of_own_terms(own: OwnTerms) -> Tunable:
+    """Returns what may be tuned of own terms: their weights, today's at zeros.
+
+        weight_i = today_i exp(clip(x_i, -10, 10)),   value = -sum_i weight_i sum_t f_i
+
+    Args:
+      own: the terms.
+    """
+
+    def sums(scene: Scene, candidates: Trajectory, mask: jax.Array) -> jax.Array:
+        rows = jnp.stack(own.rows(scene, candidates), axis=-1)  # [T, K, F]
+        return jnp.sum(jnp.where(mask[:, None, None], rows, 0.0), axis=0)
+
+    def weights(vector: jax.Array) -> jax.Array:
+        times = jnp.exp(jnp.clip(vector, -LARGEST_TERM_LOG, LARGEST_TERM_LOG))
+        return jnp.asarray(own.weights, jnp.float32) * times
+
+    return Tunable(
+        names=own.names,
+        baseline=weights,
+        known=sums,
+        values=lambda known, weights, _: -jnp.sum(known * weights, axis=-1),
+    )
 
 
 class ValuedScenes(NamedTuple):
@@ -364,7 +394,7 @@ def problem(
 
 def _best(
     kind: Tunable, objective: Objective, budget: int, seed: int, search: str
-) -> Baseline:
+) -> Any:  # noqa: ANN401
     start = np.zeros(len(kind.names))
     best, _ = tune(objective, start, SIGMA, budget, seed, search)
     return kind.baseline(jnp.asarray(best, jnp.float32))
@@ -437,6 +467,37 @@ def tune_idm(
     objective, _ = problem(DRIVER, dataset, own, LONG_SCENES)
     found = _best(DRIVER, objective, evaluations, 0, search).fields()
     return Idm(**{name: float(value) for name, value in found.items()})
+
+
+def search_own_terms(
+    own: OwnTerms,
+    dataset: Demonstrations,
+    setup: RankingSetup,
+    epochs: int,
+    evaluations: int = 300,
+    search: str = "cma",
+) -> tuple[float, ...]:
+    """Finds weights of own terms by a search: the rival of learning them.
+
+    Args:
+      own: the terms; the search starts at today's weights.
+      dataset: only its training split is read.
+      setup: sampler, horizon and what is seen of the others.
+      epochs: the learner's, whose queries are looked at here too, if they are more.
+      evaluations: of the search, at least.
+      search: one of `SEARCHES`.
+
+    Returns:
+      [F] the weights with which the chosen candidates end nearest to the humans.
+    """
+    split = dataclasses.replace(setup, split="train")
+    kind = of_own_terms(own)
+    objective, each = problem(kind, dataset, split, LONG_SCENES)
+    queries = dataset.indices("train").size * num_candidates(setup.sampler) * epochs
+    budget = max(evaluations, queries // each)
+    if len(own.names) == 1:  # one weight alone decides nothing
+        return own.weights
+    return tuple(np.asarray(_best(kind, objective, budget, 0, search)).tolist())
 
 
 def as_numbers(baselines: Iterable[Baseline]) -> list[dict[str, float]]:

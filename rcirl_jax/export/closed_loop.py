@@ -368,6 +368,7 @@ def gate_job(
     baselines: Sequence[str] = ("IDM",),
     tuned_idm: Idm | None = None,
     track: str = "full",
+    beside: Mapping[str, str] | None = None,
 ) -> tuple[SuiteJob, str]:
     """The suite that both drive, and the name of the incumbent's row.
 
@@ -383,6 +384,7 @@ def gate_job(
       baselines: further baselines.
       tuned_idm: of a further row.
       track: of the safety filter, `SafetyConfig.track`.
+      beside: further rows: name -> weights file.
 
     Raises:
       InputError: a duration, suite or count that cannot be.
@@ -406,6 +408,7 @@ def gate_job(
     names = [*baselines] if theirs else [incumbent, *baselines]
     files = {CANDIDATE: candidate, **({INCUMBENT: incumbent} if learned else {})}
     files = {name: x for name, x in files.items() if name not in planners}
+    files |= beside or {}
     job = SuiteJob(
         weights=tuple(files.values()),
         names=tuple(files),
@@ -445,8 +448,8 @@ def _asked_about() -> tuple[Scene, Candidates]:
     return scenes, draw(keys, scenes)
 
 
-def write_today(path: Path, train: TrainConfig) -> Reward:
-    """Writes the weights with which own terms drive today, as a weights file.
+def write_own_terms(path: Path, train: TrainConfig) -> Reward:
+    """Writes own terms with given weights, `train.reward.today`, as a weights file.
 
     The terms are asked about the first scenes of the catalogue before.
 

@@ -9,6 +9,7 @@ RUN/seeds/N.msgpack    every seed's reward
 RUN/weights.msgpack    the candidate: of the seeds the one with the median share of
                        training pairs won
 RUN/today.msgpack      own terms with the weights that drive today
+RUN/searched.msgpack   own terms with the weights that a search finds, a baseline
 RUN/terms.yaml         own terms with the tuned weights, beside today's
 RUN/tuned_idm.json     the driver model tuned on the training scenes, a baseline
 RUN/ranking.json       held-out scenes as the planner sees them, beside baselines
@@ -130,6 +131,11 @@ class Run:
     def today(self) -> Path:
         """Own terms with the weights that drive today."""
         return self.folder / TODAY
+
+    @property
+    def searched(self) -> Path:
+        """Own terms with the weights that a search finds."""
+        return self.folder / "searched.msgpack"
 
     @property
     def terms(self) -> Path:

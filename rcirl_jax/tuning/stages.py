@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from rcirl_jax.data.store.dataset import Dataset, Demonstrations
-from rcirl_jax.evaluation.baselines import tune_idm
+from rcirl_jax.evaluation.baselines import TERMS_ROW, search_own_terms, tune_idm
 from rcirl_jax.evaluation.closed_loop import dial
 from rcirl_jax.evaluation.closed_loop.likeness import (
     held_out_likeness,
@@ -38,6 +38,7 @@ from rcirl_jax.export.closed_loop import (
     left_out,
     read_tuned_idm,
     suite_facts,
+    write_own_terms,
     write_tuned_idm,
 )
 from rcirl_jax.export.forms import terms_yaml
@@ -45,6 +46,7 @@ from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.loading import open_reward, scorer_of
 from rcirl_jax.export.sweep import SWEEP, read_sweep
 from rcirl_jax.export.weights import save_with_dial
+from rcirl_jax.features import feature_map
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW
 from rcirl_jax.report.replays import Replay, make_replays
 from rcirl_jax.runtime.atomic_files import read_json, write_json, write_whole
@@ -174,8 +176,27 @@ def rank(run: Run, dataset: Demonstrations) -> None:
         write_tuned_idm(path, tune_idm(dataset, setup, evaluations, search))
 
     run.stage("tune", inputs, [path], work)
+    if config.train.reward.today:
+        _search_terms(run, dataset, inputs)
     for futures in FUTURES:
         _rank(run, dataset, futures)
+
+
+def _search_terms(run: Run, dataset: Demonstrations, inputs: Mapping) -> None:
+    """Searches weights of own terms, with at least the queries of a training."""
+    config, train = run.config, run.config.train
+    own = feature_map(train.features).own
+    assert own is not None
+
+    def work() -> None:
+        setup = RankingSetup(horizon_s=config.horizon_s, sampler=_ranked_sampler(run))
+        epochs, search = train.epochs, config.search
+        found = search_own_terms(own, dataset, setup, epochs, IDM_EVALUATIONS, search)
+        reward = dataclasses.replace(train.reward, today=found)
+        write_own_terms(run.searched, dataclasses.replace(train, reward=reward))
+
+    facts = {**inputs, "terms": own.sha256, "epochs": train.epochs}
+    run.stage("tune terms", facts, [run.searched], work)
 
 
 def _ranked_sampler(run: Run) -> SamplerConfig:
@@ -197,6 +218,9 @@ def _rank(run: Run, dataset: Demonstrations, futures: str) -> None:
         "futures": futures,
         "tuned_idm": dataclasses.asdict(tuned),
     }
+    searched = run.searched if config.train.reward.today else None
+    if searched:
+        inputs["searched"] = file_sha256(searched)
 
     def work() -> None:
         rewards = [open_reward(str(file)) for file in run.seed_files]
@@ -204,6 +228,8 @@ def _rank(run: Run, dataset: Demonstrations, futures: str) -> None:
         known = run.incumbent_reward()
         if known is not None:
             learned[INCUMBENT] = [scorer_of(known)]
+        if searched:
+            learned[TERMS_ROW] = [scorer_of(open_reward(str(searched)))]
         setup = RankingSetup(
             preset=str(rewards[0].preset),
             sampler=_ranked_sampler(run),
@@ -214,6 +240,7 @@ def _rank(run: Run, dataset: Demonstrations, futures: str) -> None:
         )
         own = [run.own_cost.name] if run.own_cost else []
         own += [INCUMBENT] if known else []
+        own += [TERMS_ROW] if searched else []
         references = [*own, "hand-set", TUNED_IDM_ROW, "random"]
         report = evaluate_ranking(dataset, learned, setup, run.executor, references)
         write_whole(text, format_table(report, 118) + "\n")
@@ -231,9 +258,10 @@ def suite_job(run: Run, *, tuned: bool = True) -> tuple[SuiteJob, str]:
 
     Args:
       run: folder and settings.
-      tuned: with the tuned IDM, once there is one.
+      tuned: with what a search has tuned, the IDM and own terms, once it has.
     """
     config = run.config
+    searched = bool(config.train.reward.today)
     return gate_job(
         str(run.weights),
         config.incumbent,
@@ -244,6 +272,7 @@ def suite_job(run: Run, *, tuned: bool = True) -> tuple[SuiteJob, str]:
         plan_every=config.plan_every,
         baselines=BASELINES,
         tuned_idm=read_tuned_idm(run.tuned_idm) if tuned else None,
+        beside={TERMS_ROW: str(run.searched)} if tuned and searched else None,
     )
 
 

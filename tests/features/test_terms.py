@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.closed_loop import write_today
+from rcirl_jax.evaluation.baselines import (
+    ValuedScenes,
+    mean_fde,
+    of_own_terms,
+    tune,
+)
+from rcirl_jax.export.closed_loop import write_own_terms
 from rcirl_jax.export.forms import own_weights, terms_yaml, with_weights
 from rcirl_jax.export.loading import features_of, open_reward
 from rcirl_jax.features import feature_map
@@ -99,7 +105,7 @@ def today(tmp_path_factory):
     """A weights file of own terms as they drive today."""
     folder = tmp_path_factory.mktemp("terms")
     train = override(load_recipe("terms").train, {"features": terms_file(folder)})
-    return write_today(folder / "today.msgpack", train)
+    return write_own_terms(folder / "today.msgpack", train)
 
 
 def test_todays_file_says_todays_weights(today):
@@ -139,10 +145,36 @@ def test_files_in_the_planners_own_words(today):
         with_weights(ranker.replace(", 1.0, 1.0, 1.0", ""), today, "ranker")
 
 
+def test_the_search_values_as_the_weights_file_and_chooses_as_hidden_weights(today):
+    features, scene = feature_map(today.preset), random_scene(0)
+    kind = of_own_terms(features.own)
+    candidates = sample(jax.random.key(0), scene, SamplerConfig())
+    mask = jnp.arange(NUM_TIMES) < 11
+    known = kind.known(scene, candidates.trajectory, mask)
+    made = kind.values(known, kind.baseline(jnp.zeros(3)), True)
+    counts = np.broadcast_to(mask, (len(made), NUM_TIMES))
+    rows = np.asarray(features.of_candidates(scene, candidates))
+    scale = NUM_TIMES * today.scale[0]
+    np.testing.assert_allclose(made, today.value(rows, counts) * scale, rtol=1e-4)
+
+    # scenes of a driver with other weights: the search comes to choose as it does
+    draw = np.random.default_rng(0)
+    some = jnp.asarray(draw.uniform(0.0, [1.0, 4.0, 900.0], (64, 20, 3)), jnp.float32)
+    chosen = jnp.argmin(some @ jnp.asarray([0.2, 1.0, 2e-3]), axis=1)
+    apart = jnp.abs(jnp.arange(20) - chosen[:, None]).astype(jnp.float32)
+    scenes = ValuedScenes(some, apart, jnp.ones((64, 20), bool))
+
+    def objective(vectors):
+        return mean_fde(kind, scenes, vectors)
+
+    _, fde = tune(objective, np.zeros(3), 1.0, 100, 0)
+    assert fde < 0.05 * objective(np.zeros((1, 3)))[0]
+
+
 def test_terms_that_have_changed_are_refused(tmp_path):
     place = terms_file(tmp_path)
     train = override(load_recipe("terms").train, {"features": place})
-    made = write_today(tmp_path / "today.msgpack", train)
+    made = write_own_terms(tmp_path / "today.msgpack", train)
     again = dataclasses.replace(made, provenance={**made.provenance, "own_terms": {}})
     with pytest.raises(InputError, match="no longer those that the weights"):
         features_of(again)
@@ -178,7 +210,7 @@ def test_a_bad_term_is_one_line(tmp_path, term, line):
         load_recipe("terms").train, {"features": terms_file(tmp_path, text)}
     )
     with pytest.raises(InputError, match=line):
-        write_today(tmp_path / "today.msgpack", train)
+        write_own_terms(tmp_path / "today.msgpack", train)
 
 
 def test_without_terms_the_recipe_is_refused():
