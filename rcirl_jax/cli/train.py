@@ -92,6 +92,8 @@ def main() -> None:
             f"epoch {epoch['epoch']}: loss {epoch['loss']:.4f}, "
             f"pairs won {epoch['pair_accuracy']:.1%}"
         )
+    for said in result.warnings:
+        print(f"warning: {said}")
     rate = result.queries / max(result.seconds, 1e-9)
     waited = result.waited_s / max(result.seconds, 1e-9)
     print(

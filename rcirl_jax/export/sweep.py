@@ -36,11 +36,20 @@ from rcirl_jax.data.store.dataset import Demonstrations, open_datasets
 from rcirl_jax.data.store.splits import Resplit, subsample, with_validation
 from rcirl_jax.errors import MALFORMED, InputError, extra_module
 from rcirl_jax.evaluation.baselines import new_study
-from rcirl_jax.evaluation.ranking.evaluate import covered_rows
+from rcirl_jax.evaluation.ranking.evaluate import RANDOM_RUNS, covered_rows
 from rcirl_jax.evaluation.ranking.learners import fitting_rows, normaliser_of
-from rcirl_jax.evaluation.ranking.metrics import METRICS, scene_metrics
+from rcirl_jax.evaluation.ranking.metrics import (
+    METRICS,
+    random_scorer,
+    scene_metrics,
+)
+from rcirl_jax.evaluation.ranking.report import not_ahead
 from rcirl_jax.evaluation.ranking.score import RankingSetup, numbered, score_scenes
-from rcirl_jax.evaluation.statistics import ClusterBootstrap, combine_seeds
+from rcirl_jax.evaluation.statistics import (
+    ClusterBootstrap,
+    combine_seeds,
+    paired_difference,
+)
 from rcirl_jax.export.from_run import verification_samples, write_weights
 from rcirl_jax.export.loading import compiled_scorer, open_reward
 from rcirl_jax.features import feature_map
@@ -49,6 +58,7 @@ from rcirl_jax.runtime.atomic_files import read_json, write_json, write_whole
 from rcirl_jax.runtime.compiling import compiles
 from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.runtime.pipeline import FILE, Stages, code_sha256, only_one
+from rcirl_jax.train.metrics import plateau_warning
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 from rcirl_jax.train.sweep import PROGRAM, Fitted, fit, freeze, members_of
 
@@ -404,18 +414,19 @@ class _Run:
             params = jax.tree.map(jnp.asarray, one.params)
             of = (params, normaliser, member, self.samples, provenance, part.seen)
             known = {"loss": loss, "pairs_won": won, "finite": bool(one.finite)}
+            known["plateau"] = plateau_warning(one.step_loss)
             reward = write_weights(self.weights_file(member), *of)
             found[member_name(member)] = {"sha256": reward.sha256, **known}
         return found
 
     def score(
         self, name: str, points: Sequence[Point]
-    ) -> dict[Point, tuple[dict[str, dict], list[dict[str, float]]]]:
+    ) -> dict[Point, tuple[dict[str, dict], list[dict[str, float]], str]]:
         """Scores trained points on the scenes of a split.
 
         Returns:
-          For each point the estimate of each metric over seeds and scenes, and the
-          means of each seed.
+          For each point the estimate of each metric over seeds and scenes, the means of
+          each seed, and `not_ahead` of random order and the hand-set cost.
 
         Raises:
           InputError: no scene covers the horizon, or all are of one vehicle.
@@ -435,6 +446,12 @@ class _Run:
             for point in points
         }
         scored = score_scenes(rows, index, setup, numbered(rewards), self.executor)
+        hand = scored.values["hand-set"], scored.human_values["hand-set"]
+        drawn = [random_scorer(run, hand[0].shape) for run in range(RANDOM_RUNS)]
+        easy = {
+            name: np.stack([scene_metrics(*x, scored.outcomes)["top1_fde"] for x in of])
+            for name, of in {"random": drawn, "hand-set": [hand]}.items()
+        }
         found = {}
         for point in points:
             keys = [f"{point.name}#{seed}" for seed in range(self.config.seeds)]
@@ -453,7 +470,9 @@ class _Run:
                 estimates[metric] = dataclasses.asdict(estimate)
                 for mean, x in zip(means, vehicles.mean(values, weight), strict=True):
                     mean[metric] = float(x)
-            found[point] = estimates, means
+            chosen = np.stack([one["top1_fde"] for one in of_seeds])
+            apart = {n: paired_difference(chosen, x, vehicles) for n, x in easy.items()}
+            found[point] = estimates, means, not_ahead(point.name, apart)
         return found
 
 
@@ -529,7 +548,7 @@ def run_sweep(
             for name, group in run.train(points, number).items():
                 groups[name] = group["facts"]
                 members |= group["members"]
-            for point, (estimates, means) in run.score("validation", points).items():
+            for point, (estimates, means, _) in run.score("validation", points).items():
                 of = point.as_json()
                 names = [member_name(one) for one in config.members(point)]
                 for seed, (name, found) in enumerate(zip(names, means, strict=True)):
@@ -541,7 +560,8 @@ def run_sweep(
         point = best(values, metric)
         names = configurations[point.name]["members"]
         member = best({n: members[n]["validation"][metric] for n in names}, metric)
-        test, means = run.score("test", [point])[point]
+        test, means, behind = run.score("test", [point])[point]
+        warnings = filter(None, (members[member]["plateau"], behind))
         body = {
             "settings": settings,
             "search": settings["search"],
@@ -561,6 +581,7 @@ def run_sweep(
                 "test": test,
                 "member_test": means[names.index(member)],
             },
+            "warnings": [f"of the sweep's best: {said}" for said in warnings],
             "made_by": made_by,
         }
         file = folder / "weights" / f"{member}.msgpack"
@@ -637,6 +658,7 @@ def table(report: Mapping) -> str:
         key=lambda item: sign * item[1]["validation"][metric]["value"],
     )
     lines = [
+        *(f"warning: {said}" for said in report.get("warnings", ())),
         f"{how['title']} on {report['scenes']['validation']} validation scenes, held "
         f"out by {report['validation_by']}; 95 % interval, spread of seeds",
         f"{'hidden':>10s} {'leaky rate':>10s} {'step size':>10s}",

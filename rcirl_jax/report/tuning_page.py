@@ -112,6 +112,8 @@ class TuningReport:
     dial: Mapping | None  # contents of dial.json
     likeness: str  # table of held-out drives; "" without
     training_runs: int  # of which the candidate is the median one
+    # why numbers may be worth nothing, by the anchor of their section
+    warnings: Mapping[str, Sequence[str]]
     # provenance: flags, commit, versions, hashes by stage
     facts: Mapping[str, object]
 
@@ -190,6 +192,8 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
         verdict=verdict,
         kind=DECISIONS[verdict.decision],
         likeness=report.likeness,
+        warnings=report.warnings,
+        headings=dict(CONTENTS),
         **{name: make() for name, make in bar},
     )
 

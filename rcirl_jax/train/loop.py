@@ -35,7 +35,7 @@ from rcirl_jax.train.featurise import (
     normaliser_rows,
     not_finite,
 )
-from rcirl_jax.train.metrics import RunLog
+from rcirl_jax.train.metrics import RunLog, plateau_warning, read_metrics
 from rcirl_jax.train.parallel import (
     Parallel,
     all_stop_after,
@@ -128,6 +128,7 @@ class TrainResult:
     queries: float  # pairs compared in this process
     seconds: float  # wall time of the steps in this process
     waited_s: float  # of it, waiting for rows
+    warnings: tuple[str, ...] = ()  # why its result may be worth nothing
 
 
 def train(
@@ -259,12 +260,21 @@ def _train(
         log.draw_time_weights(
             step, effective_params(state.params, config.reward)["gamma"]
         )
+    warnings: tuple[str, ...] = ()
+    if is_first():
+        rows = read_metrics(workdir / "metrics.jsonl")
+        said = plateau_warning(
+            [np.nan if row.get("loss") is None else row["loss"] for row in rows]
+        )
+        warnings = (said,) if said else ()
+        describe_run(workdir, config, dataset, {**provenance, "warnings": warnings})
     return TrainResult(
         state=state,
         epochs=summaries,
         queries=log.queries,
         seconds=log.seconds,
         waited_s=ahead.waited_s,
+        warnings=warnings,
     )
 
 

@@ -19,6 +19,8 @@ from rcirl_jax.train.step import StepMetrics
 from rcirl_jax.train.trackers import Writer, settings_of, time_weights, trackers
 
 MAX_STEP = 2**63 - 1  # what 64 bits hold
+PLATEAU_STEPS = 100  # fewer do not show whether the loss still falls
+PLATEAU = 0.05  # share of the loss's whole fall that its last fifth may be
 
 
 class MetricsWriter:
@@ -97,6 +99,46 @@ def pairs_won(path: Path, steps: int) -> float:
         )
     won = sum(share * pairs for share, pairs in whole)
     return won / max(sum(pairs for _, pairs in whole), 1.0)
+
+
+def plateau_warning(losses: ArrayLike) -> str:
+    """Says that a training ended before a plateau, or too early to tell; else "".
+
+    With a, b and c the mean losses of the first tenth of the steps, of the fourth fifth
+    and of the last fifth, and s the standard error of b - c from the spread within the
+    two fifths, the loss still falls if
+
+        b - c > PLATEAU (a - c)    and    b - c > 2 s
+
+    A training whose loss decays as exp(-t / tau) is at a plateau after 4 tau.
+
+    Args:
+      losses: [n] of every step; one that is not finite does not count.
+    """
+    loss = np.asarray(losses, float)
+    loss = loss[np.isfinite(loss)]
+    count, fifth = loss.size, loss.size // 5
+    if count < PLATEAU_STEPS:
+        return (
+            f"training: {count} steps do not show whether the loss still falls: "
+            f"expected at least {PLATEAU_STEPS}"
+        )
+    before, last = loss[-2 * fifth : -fifth], loss[-fifth:]
+    whole = float(loss[: count // 10].mean() - last.mean())
+    fall = float(before.mean() - last.mean())
+    if whole <= 0.0:
+        return (
+            f"training: the loss did not fall in {count} steps: "
+            f"{loss[: count // 10].mean():.4g} at first, {last.mean():.4g} at last"
+        )
+    error = np.sqrt((before.var(ddof=1) + last.var(ddof=1)) / fifth)
+    if fall <= PLATEAU * whole or fall <= 2.0 * error:
+        return ""
+    return (
+        f"training ended before a plateau: {100.0 * fall / whole:.0f} % of the loss's "
+        f"whole fall is in the last fifth of {count} steps (a plateau: at most "
+        f"{100.0 * PLATEAU:g} %)"
+    )
 
 
 def _is_number(value: Any) -> bool:  # noqa: ANN401

@@ -39,6 +39,7 @@ class Fitted(flax.struct.PyTreeNode, kw_only=True):
     params: RewardParams  # leaves [M, ...]
     loss: jax.Array  # [M, epochs] mean loss of each epoch
     wins: jax.Array  # [M, epochs] share of pairs the human wins
+    step_loss: jax.Array  # [M, steps] mean loss of each step
     finite: jax.Array  # [M] bool, no step was refused for a NaN or infinity
 
 
@@ -135,14 +136,16 @@ def _fit(
         sums = jax.tree.map(lambda x: jnp.sum(x, axis=0), seen)
         loss = sums.loss_sum / jnp.maximum(sums.terms, 1.0)
         wins = sums.wins / jnp.maximum(sums.pairs, 1.0)
-        return states, (loss, wins, jnp.all(seen.finite, axis=0))
+        steps = seen.loss_sum / jnp.maximum(seen.terms, 1.0)
+        return states, (loss, wins, steps, jnp.all(seen.finite, axis=0))
 
-    states, (loss, wins, fine) = jax.lax.scan(
+    states, (loss, wins, steps, fine) = jax.lax.scan(
         epoch, jax.vmap(first)(members), jnp.arange(config.epochs)
     )
     return Fitted(
         params=cast(RewardParams, states.params),
         loss=loss.T,
         wins=wins.T,
+        step_loss=steps.reshape(-1, steps.shape[-1]).T,
         finite=jnp.all(fine, axis=0),
     )

@@ -9,6 +9,7 @@ which does not grow with the work, counts in neither.
 """
 
 import dataclasses
+import itertools
 import shlex
 import textwrap
 import time
@@ -42,6 +43,7 @@ from rcirl_jax.tuning.stages import (
     train_seeds,
     turn_dial,
     verdict_of,
+    warnings_of,
 )
 
 STAGES = ("import", "demonstrate", "train", "rank", "simulate", "gate", "report")
@@ -88,7 +90,8 @@ def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
                 break
             clock.begin(name, work_of(run, job, made.recorded))
     if made.verdict is not None:
-        run.say(_ending(run, made.verdict, made.page, job.refs[0].id))
+        warned = warnings_of(run)
+        run.say(_ending(run, made.verdict, made.page, job.refs[0].id, warned))
     elif "train" in names:
         run.say(f"weights: {run.weights}")
 
@@ -114,8 +117,10 @@ def _stages(
     yield "train"
     train_seeds(run, everything, sources)
     run.say(_said_of_weights(run))
+    _warn(run, "training")
     yield "rank"
     rank(run, recorded)
+    _warn(run, "ranking")
     yield "simulate"
     simulate(run, sources)
     yield "gate"
@@ -123,6 +128,12 @@ def _stages(
     yield "report"
     turn_dial(run, sources)
     made.page = _drawn(run, made.verdict, recorded, sources)
+
+
+def _warn(run: Run, section: str) -> None:
+    """Says what the run has to warn of in one section."""
+    for said in warnings_of(run).get(section, ()):
+        run.say(f"warning: {said}")
 
 
 def _drawn(
@@ -138,7 +149,13 @@ def _drawn(
     return f"report to open: {run.page}"
 
 
-def _ending(run: Run, verdict: Verdict, page: str, first: str) -> str:
+def _ending(
+    run: Run,
+    verdict: Verdict,
+    page: str,
+    first: str,
+    warned: Mapping[str, Sequence[str]],
+) -> str:
     """Returns the last lines: verdict, reason, files, next command; about eight.
 
     Args:
@@ -146,9 +163,12 @@ def _ending(run: Run, verdict: Verdict, page: str, first: str) -> str:
       verdict: of the gate.
       page: a line on the report, if it was asked for.
       first: case to look at where the verdict names none.
+      warned: of `warnings_of`.
     """
     lines = ["", f"verdict: {verdict.decision.upper()}"]
     lines += textwrap.wrap(verdict.sentence, WIDTH)
+    for said in itertools.chain(*warned.values()):
+        lines += textwrap.wrap(f"warning: {said}", WIDTH)
     lines += [f"weights: {run.weights}", f"all tables: {run.tables}"]
     lines += [page] if page else []
     case = (*verdict.look_at, first)[0]

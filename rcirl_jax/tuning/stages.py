@@ -150,6 +150,38 @@ def _workdir(run: Run, dataset: Demonstrations, seed: int) -> Path:
     return _folder_of(run, _decides_training(run, dataset), seed)
 
 
+def training_of_candidate(run: Run) -> Path:
+    """Returns the folder of the candidate's training run, by the notes of its stage."""
+    seed = int(open_reward(str(run.weights)).provenance["seed"])
+    noted = run.stages.read().get(f"train {seed}", {}).get("inputs", {})
+    decided = {name: noted.get(name) for name in ("config", "dataset", *run.code())}
+    return _folder_of(run, decided, seed)
+
+
+def warnings_of(run: Run) -> dict[str, list[str]]:
+    """Returns why numbers of a run may be worth nothing, by the report's sections.
+
+    What the training, the rankings and a sweep have written; a file that is not there
+    says nothing.
+    """
+    rankings = [run.folder / f"{stem}.json" for stem in ("ranking", "ranking_recorded")]
+    files = {
+        "training": [training_of_candidate(run) / "run.json"],
+        "ranking": rankings,
+        "sweep": [run.config.sweep / SWEEP] if run.config.sweep else [],
+    }
+    found = {
+        section: [
+            said + (" (with recorded futures)" if file == rankings[1] else "")
+            for file in some
+            if file.is_file()
+            for said in read_json(file, "JSON").get("warnings", ())
+        ]
+        for section, some in files.items()
+    }
+    return {section: said for section, said in found.items() if said}
+
+
 def _folder_of(run: Run, decided: Mapping[str, object], seed: int) -> Path:
     return run.folder / f"train-{digest(decided)[:8]}" / f"seed-{seed}"
 
@@ -429,12 +461,14 @@ def gate(run: Run) -> Verdict:
         "gate": dataclasses.asdict(run.config.gate),
         "incumbent": incumbent,
         "left_out": left_out(job),
+        "warnings": warnings_of(run),
     }
 
     def work() -> None:
         files = {"candidate": str(run.weights), "incumbent": run.config.incumbent}
         runs = {"training_runs": run.config.seeds}
         facts = {"files": files, **runs, **suite_facts(job)}
+        facts["warnings"] = warnings_of(run)
         facts["made_by"] = run.provenance()
         write_verdict(path, verdict, run.config.gate, facts)
         drives = (run.folder / "likeness.txt").read_text()
@@ -456,6 +490,7 @@ def report(
         "incumbent": run.incumbent_hash(),
         "dataset": dataset.hash,
         "recipe": config.recipe,
+        "warnings": warnings_of(run),
     }
     if run.dial.exists():
         inputs["dial"] = file_sha256(run.dial)
@@ -470,10 +505,6 @@ def report(
         if known := run.incumbent_reward():
             rewards[INCUMBENT] = known
         stages = run.stages.read()
-        # the training run of the candidate, by the notes of its stage
-        seed = int(rewards[CANDIDATE].provenance["seed"])
-        noted = stages.get(f"train {seed}", {}).get("inputs", {})
-        decided = {name: noted.get(name) for name in ("config", "dataset", *run.code())}
         names = (
             *(f"import {number}" for number in range(len(sources))),
             *(f"train {number}" for number in range(config.seeds)),
@@ -497,11 +528,12 @@ def report(
                 rewards=rewards,
                 dataset=dataset,
                 replays=_replays(run, verdict, sources),
-                workdir=_folder_of(run, decided, seed),
+                workdir=training_of_candidate(run),
                 sweep=read_sweep(config.sweep) if config.sweep else None,
                 dial=read_json(run.dial, "a dial") if run.dial.exists() else None,
                 likeness=(run.folder / "likeness.txt").read_text(),
                 training_runs=config.seeds,
+                warnings=warnings_of(run),
                 facts={"recipe": config.recipe, **run.facts, "stages": shown},
             ),
         )

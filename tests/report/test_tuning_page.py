@@ -24,7 +24,7 @@ from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.metrics import COLUMNS
 from rcirl_jax.units import TIMES_S
 from tests.report.test_data_page import HOSTILE, Page
-from tests.report.tuning_case import PLAYED
+from tests.report.tuning_case import PLAYED, WARNINGS
 
 MAX_BYTES = 3e6
 ANCHORS = re.compile(r'<section id="(\w+)"')
@@ -75,6 +75,14 @@ def test_it_is_one_small_file_that_needs_no_other_and_runs_its_own_script(file, 
     (code,) = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
     digest = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
     assert f"script-src 'sha256-{digest}'" in policy
+
+
+def test_warnings_are_at_the_top_of_their_sections(page):
+    for anchor, (said,) in WARNINGS.items():
+        found = section(page, anchor)
+        assert found.index(said) < found.index("<figure>")
+        assert f'<a href="#{anchor}">' in section(page, "verdict")
+    assert page.count("<strong>Warning:</strong>") == len(WARNINGS)
 
 
 def test_sections_are_linked(page):

@@ -25,6 +25,7 @@ from tests.helpers.weights_files import random_weights
 FAMILIES, EACH = ("stop_and_go", "cut_in", "red_light"), 40
 PLAYED = ("stop_and_go/001@0", "red_light/000@0")
 SECONDS = 5.0
+WARNINGS = {"training": ["too few steps"], "sweep": ["its best is no better"]}
 
 
 def metrics(seed, spoiled=None):
@@ -121,7 +122,7 @@ def small_report(folder, replays):
         gate=GateConfig(), suite=suite, incumbent="hand-set", ranking=ranking(),
         rewards={"candidate": candidate, "incumbent": incumbent},
         dataset=open_dataset(folder / "set"), replays=replays, workdir=workdir,
-        sweep=sweep_result(), dial=dial_result(), training_runs=3,
+        sweep=sweep_result(), dial=dial_result(), training_runs=3, warnings=WARNINGS,
         facts={"flags": {"seed": 3}, "git_commit": "abc", "stages": {"train": "12ef"}},
     )  # fmt: skip
 

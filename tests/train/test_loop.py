@@ -117,6 +117,8 @@ def test_run_writes_what_it_should(run):
     assert result.epochs[-1]["epoch"] == 3
     assert result.queries > 0
     assert read_config(workdir)[0] == CONFIG
+    (told,) = result.warnings  # of a run of a few steps
+    assert read_config(workdir)[1]["warnings"] == [told]
 
 
 def test_export_and_rank(dataset, run, tmp_path):

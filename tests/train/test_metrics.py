@@ -3,12 +3,18 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.from_run import last_metrics
 from rcirl_jax.report.frames import draw_training
-from rcirl_jax.train.metrics import MetricsWriter, pairs_won, read_metrics
+from rcirl_jax.train.metrics import (
+    MetricsWriter,
+    pairs_won,
+    plateau_warning,
+    read_metrics,
+)
 
 WHOLE = {"loss": 0.5, "pair_accuracy": 0.75, "pairs": 4.0, "queries_per_s": 1.0}
 DAMAGED = (
@@ -59,3 +65,22 @@ def test_pairs_won_are_those_of_the_last_steps(tmp_path):
         pairs_won(path, 2)
     with pytest.raises(InputError, match=r"nowhere\.jsonl: 0 whole lines"):
         pairs_won(tmp_path / "nowhere.jsonl", 1)
+
+
+@pytest.mark.parametrize(
+    ("steps", "tau", "noise", "words"),
+    [
+        (500, 100.0, 0.01, ""),
+        (500, 500.0, 0.001, "before a plateau: 17 % of the loss's whole fall"),
+        (500, 500.0, 2.0, ""),  # not told from noise
+        (500, -500.0, 0.0, "the loss did not fall in 500 steps"),
+        (30, 5.0, 0.0, "30 steps do not show whether"),
+    ],
+)
+def test_a_training_that_ends_too_early_is_told(steps, tau, noise, words):
+    """An exponential: of n = tau steps the shares follow from its integrals."""
+    at = np.arange(steps) + 0.5
+    drawn = np.random.default_rng(0).normal(size=steps)
+    found = plateau_warning(3.0 + np.exp(-at / tau) + noise * drawn)
+    assert words in found
+    assert bool(words) == bool(found)

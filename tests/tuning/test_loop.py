@@ -98,7 +98,9 @@ def test_what_to_do_next_without_a_report_is_to_have_one(tmp_path):
     )
 
     def last(page):
-        return loop._ending(run, verdict, page, "b@0").splitlines()[-1]
+        said = loop._ending(run, verdict, page, "b@0", {"training": ["too short"]})
+        assert "\nwarning: too short\n" in said
+        return said.splitlines()[-1]
 
     assert "rcirl replay --weights=w --case=a@0" in last("report to open: r")
     assert f"rcirl report --run={tmp_path}" in last(loop.NO_REPORT + "x")

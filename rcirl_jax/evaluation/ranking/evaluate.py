@@ -15,7 +15,12 @@ from rcirl_jax.evaluation.ranking.metrics import (
     random_scorer,
     scene_metrics,
 )
-from rcirl_jax.evaluation.ranking.report import Ranked, RankingReport, build_report
+from rcirl_jax.evaluation.ranking.report import (
+    Ranked,
+    RankingReport,
+    build_report,
+    ranking_warnings,
+)
 from rcirl_jax.evaluation.ranking.score import (
     PriorCostScorer,
     RankingSetup,
@@ -160,7 +165,11 @@ def evaluate_ranking(
       executor: as there.
       references: rows that the others are compared with; default: the usual baselines.
     """
-    return build_report(rank_scenes(dataset, learned, setup, executor), references)
+    ranked = rank_scenes(dataset, learned, setup, executor)
+    report = build_report(ranked, references)
+    easy = ("random", setup.own.name if setup.own else "hand-set")
+    warnings = ranking_warnings(report, list(learned), easy)
+    return dataclasses.replace(report, warnings=warnings)
 
 
 def oracle_floor(dataset: Demonstrations, setup: RankingSetup, max_scenes: int) -> dict:

@@ -93,6 +93,7 @@ class RankingReport:
     oracle_floor_median: Estimate  # m
     confidence: float
     num_resamples: int
+    warnings: tuple[str, ...] = ()  # of `ranking_warnings`
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -206,6 +207,49 @@ def build_report(
         confidence=CONFIDENCE,
         num_resamples=num_resamples,
     )
+
+
+def ranking_warnings(
+    report: RankingReport, rows: Sequence[str], references: Sequence[str]
+) -> tuple[str, ...]:
+    """Says which rows are not shown to rank better than one that should be easy.
+
+    Args:
+      report: with comparisons of top-1 FDE.
+      rows: learned ones.
+      references: random order and the planner's own cost, by name.
+    """
+    found = (
+        not_ahead(
+            row,
+            {
+                c.reference: c.difference
+                for c in report.comparisons
+                if c.metric == "top1_fde" and c.row == row and c.reference in references
+            },
+        )
+        for row in rows
+    )
+    return tuple(filter(None, found))
+
+
+def not_ahead(row: str, apart: Mapping[str, Difference]) -> str:
+    """Says of which others a row's choice is not nearer to the human for certain.
+
+    Args:
+      row: who chose.
+      apart: m, its top-1 FDE minus that of each other, with paired intervals.
+
+    Returns:
+      One sentence; "" if the row is ahead of all.
+    """
+    said = [
+        ("worse than" if d.low > 0.0 else "not shown to be better than")
+        + f" {other}, top-1 {d.mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}] m"
+        for other, d in apart.items()
+        if d.high >= 0.0
+    ]
+    return f"ranking: {row} is {'; '.join(said)}" if said else ""
 
 
 def is_baseline(row: str) -> bool:
@@ -431,6 +475,7 @@ def _heading(report: RankingReport) -> list[str]:
         f"chosen, or nothing feasible) is charged at least {report.failure_m:g} m. "
         f"Miss: FDE above {report.miss_threshold_m:.2g} m.",
     ]
+    heading += [f"warning: {said}" for said in report.warnings]
     if report.counts["vehicles"] < FEW_VEHICLES:
         heading.append(
             f"Fewer than {FEW_VEHICLES} vehicles: bootstrap intervals are too short."

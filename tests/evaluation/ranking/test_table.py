@@ -24,6 +24,7 @@ from rcirl_jax.evaluation.ranking.report import (
     format_table,
     from_json,
     markdown_table,
+    ranking_warnings,
     to_json,
     verdict,
 )
@@ -237,6 +238,29 @@ def test_bad_input_is_refused(scorers, outcomes, report):
         build_report(ranked(scorers, outcomes), ["nobody"])
     with pytest.raises(InputError, match="width"):
         format_table(report, 99)
+
+
+def test_a_row_that_is_not_ahead_of_an_easy_one_is_told(scorers, outcomes, report):
+    easy = ("random", "hand-set")
+    assert not ranking_warnings(report, ["rc-irl"], easy)
+    (same,) = ranking_warnings(report, ["twin"], easy)  # as noisy as hand-set
+    assert same.startswith("ranking: twin is not shown to be better than hand-set, ")
+    assert "random" not in same
+    worst = {
+        **scorers,
+        "twin": [scene_metrics(outcomes.fde, outcomes.fde[:, 0], outcomes)],
+    }
+    found = build_report(ranked(worst, outcomes))
+    said = ranking_warnings(found, ["twin"], easy)
+    (apart,) = (
+        c.difference for c in found.comparisons
+        if (c.row, c.reference, c.metric) == ("twin", "random", "top1_fde")
+    )  # fmt: skip
+    assert f"worse than random, top-1 {apart.mean:+.2f} [" in said[0]
+    assert "worse than hand-set" in said[0]
+    again = dataclasses.replace(found, warnings=said)
+    assert from_json(to_json(again)).warnings == said
+    assert "warning: ranking: twin is worse" in format_table(again)
 
 
 def test_markdown_has_the_numbers_and_the_difference_to_one_row(scorers, outcomes):
