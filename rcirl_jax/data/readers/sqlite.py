@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.readers.tables.streams import first_bytes
 from rcirl_jax.errors import InputError
 
 MAGIC = b"SQLite format 3\x00"
@@ -33,24 +34,19 @@ class Database:
         self.path = path
 
     def __enter__(self) -> "Database":
-        try:
-            with self.path.open("rb") as handle:
-                head = handle.read(100)
-            size = self.path.stat().st_size
-            if len(head) < 100 or not head.startswith(MAGIC):
-                raise self.error("database", f"{head[:16]!r}", "a SQLite file")
-            page, pages = (
-                int.from_bytes(head[k:n], "big") for k, n in [(16, 18), (28, 32)]
+        head, size = first_bytes(self.path, 100), self.path.stat().st_size
+        if len(head) < 100 or not head.startswith(MAGIC):
+            raise self.error("database", f"{head[:16]!r}", "a SQLite file")
+        page, pages = (
+            int.from_bytes(head[k:n], "big") for k, n in [(16, 18), (28, 32)]
+        )
+        expected = pages * (65536 if page == 1 else page)
+        if head[24:28] == head[92:96] and size < expected:  # the head is valid
+            raise self.error(
+                "size", f"{size} bytes", f"{expected} bytes; truncated file?"
             )
-            expected = pages * (65536 if page == 1 else page)
-            if head[24:28] == head[92:96] and size < expected:  # the head is valid
-                raise self.error(
-                    "size", f"{size} bytes", f"{expected} bytes; truncated file?"
-                )
-            uri = f"{self.path.resolve().as_uri()}?mode=ro&immutable=1"
-            self._connection = sqlite3.connect(uri, uri=True, isolation_level=None)
-        except (OSError, sqlite3.Error) as error:
-            raise self.error("database", str(error), "a SQLite file") from error
+        uri = f"{self.path.resolve().as_uri()}?mode=ro&immutable=1"
+        self._connection = sqlite3.connect(uri, uri=True, isolation_level=None)
         self._ticks = max(MIN_STEPS, STEPS_PER_BYTE * size) // CHECK_STEPS
         try:
             for pragma in ("trusted_schema=OFF", "query_only=ON", "cell_size_check=ON"):
@@ -58,10 +54,8 @@ class Database:
         except InputError:
             self._connection.close()
             raise
-        limit = self._connection.setlimit
-        limit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
-        limit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
-        limit(sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH, 1)
+        self._connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
+        self._connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
         self._connection.set_progress_handler(self._tick, CHECK_STEPS)
         self._connection.set_authorizer(
             lambda action, *_: (
@@ -87,18 +81,15 @@ class Database:
         Raises:
           InputError: it is a view or a virtual table, or the schema is broken.
         """
-        sql = "SELECT type, sql FROM sqlite_master WHERE name = ?"
-        found = [
-            row for rows in self.chunks(sql, (table,), values=(table,)) for row in rows
-        ]
-        kinds = [row for row in found if row[0] in ("table", "view")]
-        if not kinds:
+        kinds = "SELECT type, sql FROM sqlite_master WHERE name = ?"
+        kinds += " AND type IN ('table', 'view')"
+        for rows in self.chunks(kinds, (table,), values=(table,)):
+            ((kind, text), *_) = rows
+            if kind != "table" or "virtual" in str(text).lower().split()[1:2]:
+                raise self.error(table, f"a view or virtual {kind}", "a table")
+            break
+        else:
             return ()
-        kind, text = kinds[0]
-        if str(text).split(maxsplit=2)[1:2] in (["VIRTUAL"], ["virtual"]):
-            kind = "virtual table"
-        if kind != "table":
-            raise self.error(table, f"a {kind}", "a table")
         cursor = self._execute(f"SELECT * FROM {_quoted(table)} LIMIT 0")
         return tuple(entry[0] for entry in cursor.description or ())
 

@@ -39,35 +39,29 @@ def read_records(path: Path, limit: int = MAX_RECORD_BYTES) -> Iterator[bytes]:
                 "damaged, or no TFRecord file"
             )
 
-    try:
-        left, count = path.stat().st_size, 0
-        with path.open("rb") as handle:
-            while left > 0:
-                where, header = f"{path}: record {count}", handle.read(HEADER.size)
-                if header.startswith(GZIP_MAGIC):
-                    expected = "expected an uncompressed TFRecord file"
-                    raise InputError(f"{where}: gzip data: {expected}")
-                if len(header) < HEADER.size:
-                    found = f"{len(header)} bytes: expected {HEADER.size}; cut off?"
-                    raise InputError(f"{where}: header: {found}")
-                length, stored = HEADER.unpack(header)
-                check(where, "length", header[:8], stored)
-                rest = left - FRAME_BYTES
-                if length > min(rest, limit):  # before anything is allocated
-                    raise InputError(
-                        f"{where}: length: {length} bytes: expected at most {limit}, "
-                        f"and {max(rest, 0)} are left in the file; cut off?"
-                    )
-                data, end = handle.read(length), handle.read(FOOTER.size)
-                if len(data) + len(end) < length + FOOTER.size:
-                    raise InputError(f"{where}: data: cut off: expected {length} bytes")
-                check(where, "data", data, *FOOTER.unpack(end))
-                left -= FRAME_BYTES + length
-                count += 1
-                yield data
-    except OSError as error:
-        why = error.strerror or error
-        raise InputError(f"{path}: {why}: expected a readable file") from error
+    left, count = path.stat().st_size, 0
+    with path.open("rb") as handle:
+        while left > 0:
+            where, header = f"{path}: record {count}", handle.read(HEADER.size)
+            if header.startswith(GZIP_MAGIC):
+                expected = "expected an uncompressed TFRecord file"
+                raise InputError(f"{where}: gzip data: {expected}")
+            if len(header) < HEADER.size:
+                found = f"{len(header)} bytes: expected {HEADER.size}; cut off?"
+                raise InputError(f"{where}: header: {found}")
+            length, stored = HEADER.unpack(header)
+            check(where, "length", header[:8], stored)
+            rest = left - FRAME_BYTES
+            if not 0 <= length <= min(rest, limit):  # before anything is allocated
+                raise InputError(
+                    f"{where}: length: {length} bytes: expected at most {limit}, "
+                    f"and {max(rest, 0)} are left in the file; cut off?"
+                )
+            data = handle.read(length)
+            check(where, "data", data, *FOOTER.unpack(handle.read(FOOTER.size)))
+            left -= FRAME_BYTES + length
+            count += 1
+            yield data
     if count == 0:
         raise InputError(f"{path}: records: none: expected at least one")
 

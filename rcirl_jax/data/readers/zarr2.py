@@ -15,7 +15,8 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from rcirl_jax.errors import InputError
+from rcirl_jax.data.readers.tables.streams import first_bytes
+from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.runtime.atomic_files import is_text, read_json
 from rcirl_jax.runtime.checked import checked
 
@@ -67,24 +68,18 @@ class StructuredArray:
         meta = checked(body, _Metadata, file)
         (self.size,), (self.chunk,) = meta.shape, meta.chunks
         self.dtype = _dtype(file, meta.dtype)
+        known = self.dtype.fields or {}
         for name, (kinds, shape) in fields.items():
-            names = self.dtype.names or ()
-            found = self.dtype[name] if name in names else None
-            if found is None:
+            found = known[name][0] if name in known else None
+            if found is None or found.base.kind not in kinds or found.shape != shape:
                 raise InputError(
-                    f"{file}: dtype: {name}: missing: expected it among {names}"
-                )
-            if found.base.kind not in kinds or found.shape != shape:
-                raise InputError(
-                    f"{file}: dtype: {name}: {found}: expected shape {shape}, "
-                    f"kind {' or '.join(kinds)}"
+                    f"{file}: dtype: {name}: {found or 'missing'}: expected shape "
+                    f"{shape}, kind {' or '.join(kinds)}, among {', '.join(known)}"
                 )
         self._texts = [name for name in fields if self.dtype[name].base.kind == "U"]
         most = MAX_CHUNK_BYTES // self.dtype.itemsize
         if not 1 <= self.chunk <= most:
-            raise InputError(
-                f"{file}: chunks: {self.chunk} records: expected 1 to {most}"
-            )
+            raise InputError(f"{file}: chunks: {self.chunk}: expected 1 to {most}")
         self._is_packed = meta.compressor is not None
         self._checked: set[int] = set()
 
@@ -100,12 +95,8 @@ class StructuredArray:
         for number in range(start // self.chunk, (stop - 1) // self.chunk + 1):
             if number not in self._checked:
                 self._check_chunk(number)
-        try:
+        with as_input_error(f"{self.path}: {where}", "whole chunks"):
             raw = self._store[start:stop].read().result()
-        except ValueError as error:
-            raise InputError(
-                f"{self.path}: {where}: {str(error)[:120]}: expected whole chunks"
-            ) from error
         records = np.ascontiguousarray(raw).reshape(-1).view(self.dtype)
         for name in self._texts:
             if not is_text(records[name]):
@@ -119,22 +110,16 @@ class StructuredArray:
     def _store(self) -> Any:  # noqa: ANN401 - tensorstore is imported when needed
         import tensorstore
 
-        # what decompresses is written in each chunk; here it only has to be valid
-        blosc = {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1}
-        metadata = {
-            "zarr_format": 2,
-            "shape": [self.size],
-            "chunks": [self.chunk],
-            "dtype": [["record", "|u1", [self.dtype.itemsize]]],
-            "compressor": {**blosc, "blocksize": 0} if self._is_packed else None,
-            "filters": None,
-            "fill_value": None,
-            "order": "C",
-        }
         spec = {
             "driver": "zarr",
             "kvstore": {"driver": "file", "path": str(self.path.resolve())},
-            "metadata": metadata,
+            "metadata": {
+                "shape": [self.size],
+                "chunks": [self.chunk],
+                "dtype": [["record", "|u1", [self.dtype.itemsize]]],
+                # what decompresses is written in each chunk
+                "compressor": {"id": "blosc"} if self._is_packed else None,
+            },
             "context": {"cache_pool": {"total_bytes_limit": CACHE_BYTES}},
         }
         return tensorstore.open(spec, open=True, assume_metadata=True).result()
@@ -142,24 +127,15 @@ class StructuredArray:
     def _check_chunk(self, number: int) -> None:
         """Checks that a chunk is there (a missing one reads as 0) and its two sizes."""
         file = self.path / str(number)
-        try:
-            size = file.stat().st_size
-            with file.open("rb") as handle:
-                head = handle.read(BLOSC_HEADER)
-        except OSError as error:
-            raise InputError(
-                f"{file}: chunk: {error.strerror}: expected a file"
-            ) from error
-        expected = self.chunk * self.dtype.itemsize
-        if self._is_packed:
+        if not file.is_file():
+            raise InputError(f"{file}: chunk: missing: expected a file")
+        sizes, expected = [file.stat().st_size], [self.chunk * self.dtype.itemsize]
+        if self._is_packed:  # the head says both: decompressed, and as it is
+            head = first_bytes(file, BLOSC_HEADER)
             unpacked, packed = (int.from_bytes(head[k:][:4], "little") for k in (4, 12))
-            if unpacked != expected:
-                raise InputError(
-                    f"{file}: chunk: {unpacked} bytes decompressed: expected {expected}"
-                )
-            expected = packed
-        if size != expected:
-            raise InputError(f"{file}: chunk: {size} bytes: expected {expected}")
+            sizes, expected = [*sizes, unpacked], [packed, *expected]
+        if sizes != expected:
+            raise InputError(f"{file}: chunk: {sizes} bytes: expected {expected}")
         self._checked.add(number)
 
 
@@ -174,12 +150,9 @@ def _dtype(file: Path, fields: list[list]) -> np.dtype:
                 "expected [name, little-endian number or text, shape]"
             )
         parts.append((name, f"<{match[1]}", *map(tuple, shape)))
-    try:
+    with as_input_error(str(file), "fields of different names"):
         dtype = np.dtype(parts)
-    except ValueError as error:
-        raise InputError(f"{file}: dtype: {error}: expected different names") from error
     if not 0 < dtype.itemsize <= MAX_RECORD_BYTES:
-        raise InputError(
-            f"{file}: dtype: {dtype.itemsize} bytes: expected 1 to {MAX_RECORD_BYTES}"
-        )
+        most = f"expected 1 to {MAX_RECORD_BYTES}"
+        raise InputError(f"{file}: dtype: {dtype.itemsize} bytes: {most}")
     return dtype

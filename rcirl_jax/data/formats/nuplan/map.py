@@ -2,8 +2,6 @@
 
 A GeoPackage is SQLite with geometry blobs (www.geopackage.org/spec, clause 2.1.3): a
 head "GP", version, flags, srs_id and an optional envelope, then well-known binary.
-It is read by hand, with numbers of points checked against the blob's length, because
-shapely's reader is no faster, and 80 kB of nested lines crash it.
 
 Layers read: baseline_paths (centre lines), lanes_polygons (limits, neighbours,
 bounds), lane_connectors (paths across junctions), boundaries,
@@ -16,7 +14,6 @@ are numbered from left to right.
 
 import functools
 import re
-import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,7 +33,7 @@ from rcirl_jax.data.formats.shapes import (
     moves,
 )
 from rcirl_jax.data.readers.sqlite import Database
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, extra_module
 from rcirl_jax.types import Lane
 
 HALF_WIDTH_M = 1.75  # m, where a lane's bounds are not in the map
@@ -49,8 +46,7 @@ MAX_ROWS = 2_000_000  # rows of one layer; a city has some 1e4
 MAX_NAME = 100  # characters of a column's name
 MAX_POINTS = 20_000  # of one line; a city's longest has some 1e3
 ENVELOPE_BYTES = (0, 32, 48, 48, 64)  # by the flags' envelope code
-LINE, POLYGON, MULTI_LINE, MULTI_POLYGON = 2, 3, 5, 6
-EWKB_Z, EWKB_M = 0x80000000, 0x40000000
+SHAPES = ("LineString", "Polygon", "MultiLineString", "MultiPolygon")
 GEOGRAPHIC = 4326  # WGS84 longitude and latitude in degrees
 EPSG = re.compile(r"(?:epsg:)?(\d{4,6})", re.IGNORECASE)
 NEEDED = ("baseline_paths", "lane_connectors", "lanes_polygons")  # layers
@@ -94,48 +90,22 @@ def points_of(blob: object) -> np.ndarray:
     """Returns points [n, 2] of a line, of a polygon's outer ring, or of the longest.
 
     Raises:
-      ValueError: no GeoPackage blob, another geometry, or a count beyond it.
+      ValueError: no GeoPackage blob, or another geometry.
     """
-    if not isinstance(blob, bytes) or blob[:2] != b"GP":
+    shapely = extra_module("shapely")
+    if not isinstance(blob, bytes) or blob[:2] != b"GP" or len(blob) < 8:
         raise ValueError("no GeoPackage geometry")
+    if blob[3] & 0x10:  # empty
+        return np.zeros((0, 2))
     try:
-        if blob[3] & 0x10:  # empty
-            return np.zeros((0, 2))
-        parts, _ = _lines(blob, 8 + ENVELOPE_BYTES[blob[3] >> 1 & 7])
-    except (struct.error, IndexError) as error:
-        raise ValueError("well-known binary cut short") from error
-    return max(parts, key=len, default=np.zeros((0, 2)))
-
-
-def _lines(
-    blob: bytes,
-    at: int,
-    kinds: Sequence[int] = (LINE, POLYGON, MULTI_LINE, MULTI_POLYGON),
-) -> tuple[list[np.ndarray], int]:
-    """Lines or outer rings, of some kinds, of well-known binary; the place behind."""
-    order = "<" if blob[at] else ">"
-    code, count = struct.unpack_from(order + "II", blob, at + 1)
-    size = 2 + bool(code & EWKB_Z) + bool(code & EWKB_M)
-    thousands, kind = divmod(code & 0x0FFFFFFF, 1000)  # Z, M, ZM of ISO
-    size += (0, 1, 1, 2)[thousands]
-    at += 9
-    if kind not in kinds:
-        raise ValueError(f"geometry type {kind}")
-    if kind in (MULTI_LINE, MULTI_POLYGON):
-        every = []
-        for _ in range(count):
-            parts, at = _lines(blob, at, (kind - 3,))
-            every += parts
-        return every, at
-    rings = []
-    for _ in range(count if kind == POLYGON else 1):
-        if kind == POLYGON:
-            (count,) = struct.unpack_from(order + "I", blob, at)
-            at += 4
-        values = np.frombuffer(blob, order + "f8", size * count, at)
-        rings.append(values.reshape(count, size)[:, :2].astype(np.float64))
-        at += values.nbytes
-    return rings[:1], at  # inner rings are stepped over
+        shape = shapely.from_wkb(blob[8 + ENVELOPE_BYTES[blob[3] >> 1 & 7] :])
+    except (IndexError, shapely.errors.GEOSException) as error:
+        raise ValueError(f"well-known binary: {error}") from error
+    if shape.geom_type not in SHAPES:
+        raise ValueError(f"geometry type {shape.geom_type}")
+    parts = [getattr(part, "exterior", part) for part in shapely.get_parts(shape)]
+    lines = map(shapely.get_coordinates, parts)
+    return max(lines, key=len, default=np.zeros((0, 2)))
 
 
 def zone_of(system: object) -> tuple[int, bool] | None:
@@ -289,22 +259,18 @@ class NuplanMap:
         table = package.rows("lanes_polygons", columns, BOUNDS)
         places = [(*map(_fid, row[:3]),) for row in table]
         lane_at = {(group, index): str(fid) for fid, group, index in places}
-        for (fid, group, index), (*_, limit, left, right) in zip(
-            places, table, strict=True
-        ):
-            beside = [
-                lane_at.get((group, index + step))
-                if NONE not in (group, index)
-                else None
-                for step in (-1, 1)
-            ]
+        for (fid, group, index), row in zip(places, table, strict=True):
+            *_, limit, left, right = row
+            is_placed = NONE not in (group, index)
+            # lane 0 is the leftmost
+            beside = [lane_at.get((group, index + step)) for step in (-1, 1)]
             sign = [lane_signs[fid]] if fid in lane_signs else []
             fields = {
                 "id": str(fid),
                 "speed_limit": limit_of(limit),
                 "successors": tuple(leaving.get(fid, ())),
-                "left": beside[0] if index else None,  # 0 is the leftmost
-                "right": beside[1],
+                "left": beside[0] if is_placed and index else None,
+                "right": beside[1] if is_placed else None,
                 "stop_sign": bool(sign),
             }
             rows[str(fid)] = (_fid(left), _fid(right)), sign, fields
@@ -315,9 +281,7 @@ class NuplanMap:
         sides, assumed = [], False
         for fid in bounds:  # distance [n] m of each from the centre line's points
             blobs = [self._bounds[fid]] if fid in self._bounds else []
-            line = np.concatenate(
-                [np.zeros((0, 2)), *self._package.lines("boundaries", blobs)]
-            )
+            (line,) = self._package.lines("boundaries", blobs) or [()]
             half = np.full(len(centre), HALF_WIDTH_M)
             if len(line):
                 half = distance_to_line(centre, line)
@@ -326,10 +290,8 @@ class NuplanMap:
         line = None
         if stops:
             places = [self._stops[fid] for fid in stops if fid in self._stops]
-            near = min(
-                places, key=lambda p: np.hypot(*(p - centre[0])), default=centre[0]
-            )
-            line = line_across(centre, sides[0], sides[1], near)
+            places.sort(key=lambda place: np.hypot(*(place - centre[0])))
+            line = line_across(centre, *sides, (places or [centre[0]])[0])
         return Lane(
             centre=centre,
             left_width=sides[0],
@@ -352,5 +314,4 @@ def _fid(value: object) -> int:
 def _fids(value: object) -> tuple[int, ...]:
     """Numbers separated by commas."""
     parts = value.split(",") if isinstance(value, str) else [value]
-    found = [_fid(part) for part in parts]
-    return tuple(fid for fid in found if fid != NONE)
+    return tuple(fid for fid in map(_fid, parts) if fid != NONE)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rcirl_jax.data.readers.tables.streams import first_bytes
-from rcirl_jax.errors import InputError, extra_module
+from rcirl_jax.errors import MALFORMED, InputError, extra_module
 
 MAX_GROUP_BYTES = 512 * 2**20  # bytes of a row group, decompressed
 MAX_ROWS = 2**33  # of a file; what is held whole has a limit of its own
@@ -67,10 +67,7 @@ def _one_line(path: Path) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except (
-        *(arrow.ArrowException, OSError, ValueError, TypeError),
-        *(LookupError, MemoryError, OverflowError),
-    ) as error:
+    except (*MALFORMED, arrow.ArrowException, OSError) as error:
         kind = "Parquet" if first_bytes(path).startswith(PARQUET) else "Feather"
         why = " ".join(str(error).split())[:200]
         raise InputError(f"{path}: {kind.lower()}: {why}: expected {kind}") from error
@@ -106,7 +103,6 @@ def _parquet(path: Path, names: Sequence[str]) -> Iterator[tuple[Any, float]]:
     with _opened(path) as file:
         found = file.metadata
         words = [n for n in names if types.is_string(file.schema_arrow.field(n).type)]
-        _check(path, "columns", found.num_columns, MAX_COLUMNS)
         groups = [found.row_group(i) for i in range(found.num_row_groups)]
         counts = [found.num_rows, *(group.num_rows for group in groups)]
         if min(counts) < 0 or max(counts) > MAX_ROWS or sum(counts[1:]) != counts[0]:
