@@ -10,11 +10,7 @@ from hypothesis import strategies as st
 
 from rcirl_jax.data.formats.synthetic import reader as synthetic
 from rcirl_jax.data.formats.synthetic.roads import ROADS
-from rcirl_jax.data.formats.synthetic.traffic import (
-    CAR,
-    Neighbours,
-    idm_acceleration,
-)
+from rcirl_jax.data.formats.synthetic.traffic import CAR, Neighbours, idm_acceleration
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Recording, Track

@@ -35,9 +35,7 @@ def lane_file_of(spec: Mapping) -> str:
 
 
 def lanes_of_toml(
-    path: Path,
-    spec: Mapping,
-    metres: Callable[[np.ndarray], np.ndarray] = np.asarray,
+    path: Path, spec: Mapping, metres: Callable[[np.ndarray], np.ndarray] = np.asarray
 ) -> tuple[Lane, ...]:
     """Returns the lanes that a source TOML gives: [[lanes]], or [lanes] with a file.
 

@@ -198,11 +198,7 @@ class Roads:
         self._low, self._high = np.array(boxes).reshape(-1, 2, 2).swapaxes(0, 1)
 
     def around(
-        self,
-        x: np.ndarray,
-        y: np.ndarray,
-        origin: np.ndarray,
-        margin: float = MARGIN_M,
+        self, x: np.ndarray, y: np.ndarray, origin: np.ndarray, margin: float = MARGIN_M
     ) -> tuple[Lane, ...]:
         """Returns lanes within a margin of positions [m], less the origin."""
         low = np.array([x.min(), y.min()]) - margin

@@ -106,11 +106,7 @@ class Database:
         return found
 
     def table(
-        self,
-        name: str,
-        columns: Sequence[str],
-        most: int,
-        optional: Sequence[str] = (),
+        self, name: str, columns: Sequence[str], most: int, optional: Sequence[str] = ()
     ) -> list[tuple]:
         """Returns all rows: the columns, which have to be there, and optional ones.
 

@@ -30,15 +30,7 @@ from rcirl_jax.data.scenes.tracks import SmoothTrack, smooth_track, steady_track
 from rcirl_jax.geometry.limits import LOOK_AHEAD_M, planning_limit
 from rcirl_jax.geometry.relevance import relevance_distance
 from rcirl_jax.sampling.kinematics import trajectory_from_positions
-from rcirl_jax.types import (
-    Demonstration,
-    Ego,
-    Kind,
-    Obstacles,
-    Path,
-    Recording,
-    Scene,
-)
+from rcirl_jax.types import Demonstration, Ego, Kind, Obstacles, Path, Recording, Scene
 from rcirl_jax.units import (
     HORIZON_S,
     NUM_OBSTACLES,

@@ -19,13 +19,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from rcirl_jax.data.inputs import InputFile, WorkUnit, recordings_in, work_units
-from rcirl_jax.data.scenes.config import (
-    CONFIRMED,
-    OPEN,
-    REJECTED,
-    TOGETHER,
-    line_name,
-)
+from rcirl_jax.data.scenes.config import CONFIRMED, OPEN, REJECTED, TOGETHER, line_name
 from rcirl_jax.data.scenes.lines import (
     MAX_RED_RUNNING,
     MIN_CROSSINGS,

@@ -223,10 +223,7 @@ def test_groups_beside_and_above_the_folder(tmp_path):
 @pytest.mark.dataset
 @pytest.mark.parametrize(
     ("folder", "files", "tracks", "groups"),
-    [
-        ("ngsim_us101_commonroad", 36, 996, 16),
-        ("ngsim_urban_commonroad", 25, 1136, 6),
-    ],
+    [("ngsim_us101_commonroad", 36, 996, 16), ("ngsim_urban_commonroad", 25, 1136, 6)],
 )
 def test_recorded_files(data_dir, folder, files, tracks, groups):
     begin = time.process_time()

@@ -242,8 +242,7 @@ TIMES = {
     },
     **{
         f"{pattern}, recognised": of(
-            column(rows(), "t", PATTERNS[pattern]),
-            note=f"column t: times as {pattern}",
+            column(rows(), "t", PATTERNS[pattern]), note=f"column t: times as {pattern}"
         )
         for pattern in ("%d.%m.%Y %H:%M:%S.%f", "%m/%d/%Y %I:%M:%S.%f %p")
     },

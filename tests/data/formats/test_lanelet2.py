@@ -79,10 +79,7 @@ def test_neighbours_of_the_same_direction(tmp_path):
 
 
 def test_two_way_lanes_and_those_of_others(lanes):
-    assert set(lanes) == {
-        *(f"3000{i}" for i in (1, 2, 3, 4, 5, 7)),
-        "30007-back",
-    }
+    assert set(lanes) == {*(f"3000{i}" for i in (1, 2, 3, 4, 5, 7)), "30007-back"}
     there, back = lanes["30007"], lanes["30007-back"]
     np.testing.assert_allclose(there.centre, back.centre[::-1])
     assert back.id not in there.successors

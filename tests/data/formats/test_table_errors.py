@@ -34,7 +34,7 @@ WRONG = {
         (
             *("0415.txt", "18.0 20.0", "18.0 1e12"),
             "line 1: Local_Y: 1e+12: expected within 1e+08",
-        ),
+        )
     ],
     "levelx": [
         ("_recordingMeta.csv", "xUtmOrigin", "xOrigin", "column xUtmOrigin: missing"),
@@ -51,7 +51,7 @@ WRONG = {
         (".osm_xy", "x='", "x='east", "position: ('east1160.0000', '1003.5000'): exp"),
     ],
     "interaction_challenge": [
-        ("_train.csv", "\n1.0,", "\n,", "line 2: case_id: '': expected a finite"),
+        ("_train.csv", "\n1.0,", "\n,", "line 2: case_id: '': expected a finite")
     ],
     "ngsim_pairs": [
         ("_00046.csv", "x_leader", "leader", "column x_leader: missing"),

@@ -6,7 +6,5 @@ A new channel or message field is read in `reader`.
 from rcirl_jax.data.formats.format import Format
 
 FORMAT = Format(
-    names=("*.record", "*.record.*"),
-    shard_bytes=2**28,
-    checked=("pattern", "topics"),
+    names=("*.record", "*.record.*"), shard_bytes=2**28, checked=("pattern", "topics")
 )

@@ -2,8 +2,4 @@
 
 from rcirl_jax.data.formats.format import Format
 
-FORMAT = Format(
-    names=("scenario_*.parquet",),
-    is_small=True,
-    free=("kinds", "sizes"),
-)
+FORMAT = Format(names=("scenario_*.parquet",), is_small=True, free=("kinds", "sizes"))

@@ -35,10 +35,7 @@ from rcirl_jax.data.formats.options import (
     recording_car,
     section,
 )
-from rcirl_jax.data.formats.perception import (
-    has_possible_speed,
-    without_outliers,
-)
+from rcirl_jax.data.formats.perception import has_possible_speed, without_outliers
 from rcirl_jax.data.formats.shapes import (
     check_coordinates,
     facing,
@@ -203,11 +200,7 @@ def _read_tracks(
 
 
 def _track(
-    file: Path,
-    name: str,
-    table: dict[str, np.ndarray],
-    rows: np.ndarray,
-    spec: dict,
+    file: Path, name: str, table: dict[str, np.ndarray], rows: np.ndarray, spec: dict
 ) -> Track:
     found, user = str(table["object_type"][rows[0]]), name.partition("#")[0]
     kind = kind_of(f"{file}: track {name}", found, section(spec, "kinds"))

@@ -2,7 +2,4 @@
 
 from rcirl_jax.data.formats.format import Format
 
-FORMAT = Format(
-    names=("*.xml",),
-    is_small=True,
-)
+FORMAT = Format(names=("*.xml",), is_small=True)

@@ -149,11 +149,7 @@ def opened(file: Path, spec: dict) -> Log:
 
 
 def _recording(
-    name: str,
-    recording: str | None,
-    values: Rows,
-    log: Log,
-    meaning: Meaning,
+    name: str, recording: str | None, values: Rows, log: Log, meaning: Meaning
 ) -> Recording:
     path, spec, columns = log.table.path, log.spec, log.columns
     span = max(np.ptp(values["x"]), np.ptp(values["y"]))

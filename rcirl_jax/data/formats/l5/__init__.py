@@ -2,6 +2,4 @@
 
 from rcirl_jax.data.formats.format import Format
 
-FORMAT = Format(
-    names=("*.zarr",),
-)
+FORMAT = Format(names=("*.zarr",))

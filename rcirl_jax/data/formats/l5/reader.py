@@ -21,18 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.formats.l5.map import (
-    SemanticMap,
-    find_map,
-    world_to_ecef,
-)
+from rcirl_jax.data.formats.l5.map import SemanticMap, find_map, world_to_ecef
 from rcirl_jax.data.formats.messages import MAX_GAP_S
-from rcirl_jax.data.formats.options import (
-    number,
-    one_pattern,
-    positive,
-    recording_car,
-)
+from rcirl_jax.data.formats.options import number, one_pattern, positive, recording_car
 from rcirl_jax.data.formats.perception import (
     UNKNOWN,
     Boxes,
@@ -41,10 +32,7 @@ from rcirl_jax.data.formats.perception import (
     placed,
     tracks_of,
 )
-from rcirl_jax.data.formats.shapes import (
-    check_coordinates,
-    origin_notes,
-)
+from rcirl_jax.data.formats.shapes import check_coordinates, origin_notes
 from rcirl_jax.data.readers.zarr2 import StructuredArray
 from rcirl_jax.data.recording import PIECE, accepted
 from rcirl_jax.errors import InputError

@@ -35,12 +35,7 @@ from rcirl_jax.data.formats.options import number
 from rcirl_jax.data.formats.projection import utm, utm_zone
 from rcirl_jax.data.formats.tracks import split_tracks
 from rcirl_jax.data.readers.tables.rows import Rows, RowStats, attach_row_stats
-from rcirl_jax.data.readers.tables.table import (
-    Table,
-    fields_of,
-    open_table,
-    read,
-)
+from rcirl_jax.data.readers.tables.table import Table, fields_of, open_table, read
 from rcirl_jax.data.recording import check_lanes_length, check_span, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, OpenRoads, Recording, Track

@@ -2,7 +2,4 @@
 
 from rcirl_jax.data.formats.format import Format
 
-FORMAT = Format(
-    names=("*.db",),
-    shard_bytes=2**28,
-)
+FORMAT = Format(names=("*.db",), shard_bytes=2**28)

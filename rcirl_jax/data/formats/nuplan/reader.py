@@ -37,10 +37,7 @@ from rcirl_jax.data.formats.perception import (
     signal_of,
     tracks_of,
 )
-from rcirl_jax.data.formats.shapes import (
-    check_coordinates,
-    origin_notes,
-)
+from rcirl_jax.data.formats.shapes import check_coordinates, origin_notes
 from rcirl_jax.data.readers.sqlite import Database
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.types import Kind, Lane, Recording, Signal, Track

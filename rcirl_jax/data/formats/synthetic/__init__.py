@@ -2,6 +2,4 @@
 
 from rcirl_jax.data.formats.format import Format
 
-FORMAT = Format(
-    names=("*.toml",),
-)
+FORMAT = Format(names=("*.toml",))

@@ -30,11 +30,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rcirl_jax.data.formats.synthetic.roads import (
-    GRID_M,
-    LATERAL_REFERENCE_MPS2,
-    ROADS,
-)
+from rcirl_jax.data.formats.synthetic.roads import GRID_M, LATERAL_REFERENCE_MPS2, ROADS
 
 # name of a driver's parameter: bounds of what a TOML may give
 DRIVER = {

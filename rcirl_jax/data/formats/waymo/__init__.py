@@ -2,8 +2,4 @@
 
 from rcirl_jax.data.formats.format import Format
 
-FORMAT = Format(
-    names=("*.tfrecord*",),
-    shard_bytes=2**30,
-    free=("kinds",),
-)
+FORMAT = Format(names=("*.tfrecord*",), shard_bytes=2**30, free=("kinds",))

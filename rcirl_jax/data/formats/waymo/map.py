@@ -257,11 +257,7 @@ def _of_lanes(
 
 
 def _signals(
-    where: str,
-    steps: Sequence[Message],
-    t: np.ndarray,
-    origin: np.ndarray,
-    spec: dict,
+    where: str, steps: Sequence[Message], t: np.ndarray, origin: np.ndarray, spec: dict
 ) -> tuple[tuple[Signal, ...], dict[int, np.ndarray], frozenset[int]]:
     """Signals by the lane they govern, stop points, lanes of flashing red."""
     if len(steps) not in (0, t.size):

@@ -31,11 +31,7 @@ from rcirl_jax.data.formats.options import (
     section,
 )
 from rcirl_jax.data.formats.perception import fitted_lanes, without_outliers
-from rcirl_jax.data.formats.shapes import (
-    check_coordinates,
-    local_origin,
-    origin_notes,
-)
+from rcirl_jax.data.formats.shapes import check_coordinates, local_origin, origin_notes
 from rcirl_jax.data.formats.tracks import of_one_name
 from rcirl_jax.data.formats.waymo.map import read_map
 from rcirl_jax.data.readers.protobuf import Message, columns, parsers

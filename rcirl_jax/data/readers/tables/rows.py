@@ -199,10 +199,7 @@ def is_far(dt: np.ndarray, distance: np.ndarray) -> np.ndarray:
 
 
 def drop_position_outliers(
-    rows: Rows,
-    stats: RowStats,
-    distance: Distance,
-    name_of: Callable[[Any], str] = str,
+    rows: Rows, stats: RowStats, distance: Distance, name_of: Callable[[Any], str] = str
 ) -> Rows:
     """Returns the rows in which no road user is far away for a moment.
 
