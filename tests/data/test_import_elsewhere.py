@@ -8,9 +8,8 @@ import pytest
 from rcirl_jax.data import importing
 from rcirl_jax.data import inputs as dealing
 from rcirl_jax.data.formats import parts
-from rcirl_jax.data.formats.format import Format
 from rcirl_jax.data.importing import ImportConfig, import_logs
-from rcirl_jax.data.inputs import InputFile, is_long, recordings_of
+from rcirl_jax.data.inputs import InputFile, recordings_of
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError, LostWorkError
 from rcirl_jax.runtime.executors import Processes, Ray, Serial
@@ -105,24 +104,6 @@ def test_shards_are_read_by_the_workers_but_long_ones_and_few(
     import_logs(shards[:count], tmp_path / "data", ALL_SCENES, executor=TWO)
     assert read == [inputs[number].name for number in read_here]
     assert count or files_of(tmp_path / "data") == here
-
-
-def test_a_shard_is_long_beyond_its_formats_limit(shards, monkeypatch):
-    by_format = {part.format: part for part in shards}
-    assert not any(map(is_long, shards[:-1]))
-    assert is_long(by_format["l5"])  # a dataset: read in pieces
-    for name, files in ("waymo", 1), ("nuplan", 1), ("apollo", 2):
-        part = by_format[name]
-        found = dealing.files_of(name, part.input)
-        assert len(found) == files
-        size = sum(file.stat().st_size for file in found)
-        for limit, expected in ((size, False), (size - 1, True)):
-            form = Format(shard_bytes=limit)
-            monkeypatch.setattr(dealing, "format_of", lambda _, form=form: form)
-            assert is_long(part) == expected
-        monkeypatch.undo()
-    folder = InputFile(format="waymo", input=shards[0].input.parent, spec={})
-    assert is_long(folder)  # any number of shards
 
 
 @pytest.mark.multiprocess

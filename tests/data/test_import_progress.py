@@ -2,14 +2,9 @@
 
 import types
 
-import numpy as np
-import pytest
-
 from rcirl_jax.data import importing
-from rcirl_jax.data.formats import parts, read_part
 from rcirl_jax.data.importing import Progress, RecordingScenes
 from rcirl_jax.data.quality import QualityReport
-from tests.data.formats.fixtures import l5, nuplan, waymo
 
 
 class Clock:
@@ -64,19 +59,3 @@ def test_time_left_by_the_share_of_one_part(monkeypatch, capsys):
         progress.show(made("b", 0.5), quality(6000))
         assert drawn(capsys)[-1].startswith("import: 75% [01:00<00:20, 6,000 scenes")
     assert drawn(capsys)[-1].startswith("import: 100% [01:00<00:00, 6,000 scenes")
-
-
-def found(name, path, **changes):
-    (part,), spec = parts(name, path)
-    return [made.progress for made in read_part(name, part, {**spec, **changes})]
-
-
-def test_formats_with_long_parts_say_how_much_is_read(tmp_path):
-    waymo.write_shards(tmp_path / "waymo", shards=1)
-    progress = found("waymo", tmp_path / "waymo")
-    assert progress == [pytest.approx(0.5, abs=0.01), 1.0]
-    log = nuplan.write(tmp_path / "nuplan").input
-    progress = found("nuplan", log, window_s=2.0)
-    assert len(progress) > 2
-    np.testing.assert_allclose(np.diff([0.0, *progress]), 1.0 / len(progress))
-    assert found("l5", l5.write(tmp_path / "l5").input) == [0.5, 1.0]

@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-from pathlib import Path
 
 import pytest
 
@@ -11,7 +10,6 @@ from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.quality import format_quality, format_splits
 from rcirl_jax.data.recording import validate_recording
-from rcirl_jax.data.store import files
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.rows import check_finite
 from rcirl_jax.errors import InputError
@@ -93,26 +91,6 @@ def test_a_recording_without_traffic_is_counted_and_skipped(tmp_path, three):
     line = refused(import_logs, [empty], tmp_path / "none", CONFIG)
     assert "1 recording, none with traffic" in line
     assert not (tmp_path / "none").exists()
-
-
-@pytest.mark.usefixtures("small_shards")
-@pytest.mark.parametrize("name", ["manifest.json", "shards/00002/shard.json"])
-def test_too_many_names_leave_what_is_finished(tmp_path, monkeypatch, three, name):
-    """A dataset that could not be read again is not written."""
-    named = [*three[:2], dataclasses.replace(three[2], name=1000 * "x")]
-    import_logs(named, tmp_path / "whole", CONFIG)
-    whole, out = files_of(tmp_path / "whole"), tmp_path / "out"
-    most = len(whole[Path(name)]) - 1
-    with monkeypatch.context() as patched:
-        patched.setitem(files.JSON_BYTES, name.rpartition("/")[2], most)
-        line = refused(import_logs, named, out, CONFIG)
-        assert re.search(f"{name}: .*: expected {most} at most", line)
-    kept = {path: path.stat().st_mtime_ns for path in out.rglob("shard.json")}
-    assert len(kept) == (3 if name == "manifest.json" else 2)
-    assert not (out / "manifest.json").exists()
-    import_logs(named, out, CONFIG)
-    assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
-    assert files_of(out) == whole
 
 
 def late(track, since):

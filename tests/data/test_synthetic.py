@@ -5,12 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from rcirl_jax.data.formats.synthetic import reader as synthetic
 from rcirl_jax.data.formats.synthetic.roads import ROADS
-from rcirl_jax.data.formats.synthetic.traffic import CAR, Neighbours, idm_acceleration
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Recording, Track
@@ -172,42 +169,6 @@ def test_lane_changes_happen_and_are_smooth(default):
 
 SAME = {"headway_s": 1.3, "jam_gap_m": 2.0}
 SAME |= {"acceleration_mps2": 1.8, "deceleration_mps2": 2.0}
-
-
-def closed_form_gap(v: float, v0: float) -> float:
-    """s_e = (s0 + v T) / sqrt(1 - (v / v0)^4), m."""
-    return (2.0 + 1.3 * v) / np.sqrt(1.0 - (v / v0) ** 4)
-
-
-@settings(max_examples=20)
-@given(st.floats(0.0, 28.0))
-def test_idm_is_at_rest_in_its_equilibrium_gap(v):
-    driver = np.zeros((), CAR)
-    for name, value in SAME.items():
-        driver[name] = value
-    now = np.array(v)
-    gap = np.array(closed_form_gap(v, 30.0))
-    assert abs(idm_acceleration(now, np.array(30.0), gap, now, driver)) < 1e-9
-    closer = idm_acceleration(now, np.array(30.0), 0.9 * gap, now, driver)
-    assert closer < 0.0
-
-
-def test_neighbour_search_equals_brute_force():
-    rng = np.random.default_rng(0)
-    cars = np.zeros(36, CAR)
-    cars["s"], cars["phase"] = rng.uniform(0.0, 300.0, 36), rng.choice([0.5, 1.0], 36)
-    cars["row"], cars["old_row"] = rng.integers(0, 5, (2, 36))
-    look = rng.integers(0, 6, 36)
-    for ahead in (True, False):
-        found, distance = Neighbours(cars).find(look, ahead)
-        for i, row in enumerate(look):
-            there = (cars["row"] == row) | (cars["phase"] < 1) & (
-                cars["old_row"] == row
-            )
-            step = (cars["s"] - cars["s"][i]) * (1 if ahead else -1)
-            step = np.where(there & (step > 0.0), step, np.inf)
-            assert distance[i] == step.min()
-            assert np.isinf(step.min()) or found[i] == step.argmin()
 
 
 @pytest.mark.parametrize(

@@ -58,22 +58,6 @@ def test_a_line_without_an_end_is_not_held(name, where, tmp_path, monkeypatch):
     assert "a line of more than 16384 characters: expected one a row" in line
 
 
-def test_rows_that_go_on_in_quotes_have_an_end(tmp_path):
-    """A quote that nothing closes makes its own line unreadable, and no others."""
-    log = tmp_path / "log.csv"
-    rows = [f"{k / 10:.1f},a,{k}.0,0.0" for k in range(300)]
-    rows[100] = rows[100].replace("a", '"a')
-    log.write_text("\n".join(["t,id,x,y", *rows]) + "\n")
-    (found,) = read_recordings("csv", log)
-    assert (found.rows.read, found.rows.unreadable) == (300, 1)
-    assert any("line 102: a quote without an end" in note for note in found.notes)
-    rows[100] = '10.0,"a\nb\nc",100.0,0.0'
-    log.write_text("\n".join(["t,id,x,y", *rows]) + "\n")
-    (found,) = read_recordings("csv", log)
-    assert (found.rows.read, found.rows.unreadable) == (300, 0)
-    assert [track.id for track in found.tracks] == ["a", "a b c"]
-
-
 def test_a_fault_of_ours_is_not_the_users(tmp_path, monkeypatch):
     """Errors of bad data become one line; a bug passes, with a note on the file."""
     fixture = csv.write(tmp_path)

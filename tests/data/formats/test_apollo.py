@@ -2,7 +2,6 @@
 
 import functools
 import re
-import shutil
 
 import numpy as np
 import pytest
@@ -71,23 +70,6 @@ def test_parts_are_drives(tmp_path):
     }
 
 
-def test_parts_named_by_when_they_began_and_copies_of_them(tmp_path):
-    """As Apollo 10 and others name them; parts follow each other inside a folder."""
-    days = [tmp_path / f"2021-07-{day}" for day in (23, 24, 25)]
-    for day in days[:2]:
-        day.mkdir()
-        first, second = fixture.write(day).files
-        first.rename(day / f"{first.name}.091215")
-        second.rename(day / f"{second.name}.20210723091219")
-        shutil.copy(day / f"{first.name}.091215", f"{first}.091215.split")
-    write(days[2] / "demo_3.5.record.split", ego_only())
-    found = list(read_recordings("apollo", tmp_path))
-    drive = "20210723091215"
-    names = [f"2021-07-23/{drive}", f"2021-07-24/{drive}", "demo_3.5"]
-    assert [made.name for made in found] == names
-    np.testing.assert_allclose(found[0].tracks[0].t, fixture.GRID, atol=1e-9)
-
-
 def test_records_that_were_never_closed_or_left_more_behind(tmp_path):
     """A record is written over without being emptied first; its index is its end.
 
@@ -151,32 +133,6 @@ def perceived(count=11, **changes):
 def test_unknown_class(tmp_path, choice, number, kind):
     found = only(tmp_path, perceived(type=number), unknown=choice).tracks
     assert [t.kind for t in found if t.id == "12"] == ([] if kind is None else [kind])
-
-
-def test_states_and_sizes_that_are_none(tmp_path):
-    found = tracks_of(only(tmp_path, perceived(length=None, width=0.0)))["12"]
-    assert (found.length, found.width) == (4.5, 1.8)
-    messages = perceived(id=-1) + perceived(position=None)[21:]
-    recording = only(tmp_path, messages)
-    assert [found.id for found in recording.tracks] == ["ego"]
-    assert has_note(recording, "22 obstacle states without")
-
-
-def test_messages_twice_and_out_of_order(tmp_path):
-    messages = ego_only()
-    found = only(tmp_path, [*messages[::-1], *messages[3:9]]).tracks[0]
-    np.testing.assert_allclose(found.x, 0.8 * np.arange(21), atol=1e-3)
-
-
-def test_heading_across_the_wrap(tmp_path):
-    """A pose every 0.1 s between the ticks of the clock."""
-    messages = []
-    for k in range(12):
-        t = 0.05 + 0.1 * k
-        pose = {"position": fixture.point(*fixture.CENTRE), "heading": (-1) ** k * 3.13}
-        messages.append((LOCALIZATION, t, fixture.localization(t, pose=pose)))
-    (ego,) = only(tmp_path, messages).tracks
-    np.testing.assert_allclose(np.cos(ego.heading), -1.0, atol=1e-4)
 
 
 def test_topics_stamped_on_different_clocks(tmp_path):
@@ -273,18 +229,6 @@ def test_example_record_of_apollo(data_dir):
     assert has_note(recording, "100% of the time")
 
 
-def test_channels_whose_type_is_not_what_is_read(tmp_path):
-    """A type is checked; one that the record does not name is read as usual."""
-    for channels in ({}, {LOCALIZATION: ""}):
-        assert only(tmp_path, ego_only(), channels=channels).tracks[0].t.size == 21
-    channels = {LOCALIZATION: "apollo.drivers.Image"}
-    line = refused(only, tmp_path, ego_only(), channels=channels)
-    assert line.endswith(
-        f"a.record: {LOCALIZATION}: message 0: type 'apollo.drivers.Image': expected "
-        "LocalizationEstimate"
-    )
-
-
 def test_of_a_silent_chassis_nobody_knows_the_mode(tmp_path):
     """Before the first message its mode was in force."""
     for manual, spans in ((True, [(1.2, np.inf)]), (False, [(-np.inf, np.inf)])):
@@ -365,36 +309,3 @@ def test_windows_are_made_while_parts_are_read_in_order(tmp_path, long):
     in_parts(tmp_path, long[800:] + long[:800], 4)
     line = refused(read, path, window_s=10.0)
     assert re.search(r"timestamp_sec: .*: goes backwards", line)
-
-
-@pytest.mark.parametrize("silence", [300.0, 86300.0])
-@pytest.mark.parametrize("piece", [5.0, 1e9])
-def test_a_long_silence_is_stepped_over(tmp_path, monkeypatch, silence, piece):
-    """What is held is not looked at once for every second of it."""
-    monkeypatch.setattr(drives, "PIECE_S", piece)
-    looked_at, recording = [], drives.Drive.recording
-    monkeypatch.setattr(
-        drives.Drive,
-        "recording",
-        lambda held, within: looked_at.append(within) or recording(held, within),
-    )
-    times = [start + 0.1 * k for start in (0.0, silence) for k in range(9)]
-    sent = [(LOCALIZATION, t, fixture.localization(t)) for t in times]
-    found = read(write(tmp_path / "a.record", sent), window_s=1.0)
-    assert [made.name for made in found] == ["a-000", f"a-{silence:.0f}"]
-    assert len(looked_at) < 10
-
-
-def test_rows_held_are_limited(tmp_path, monkeypatch):
-    monkeypatch.setattr(drives, "MAX_ROWS", 100)
-    line = refused(read, in_parts(tmp_path, long_drive(8.0), 1))
-    assert "more than 100 obstacle states" in line
-
-
-def test_a_mode_that_was_said_long_ago_is_not_known(tmp_path):
-    """Windows that hold no message of the chassis."""
-    sent = [(CHASSIS, 0.0, fixture.chassis(0.0, manual=False)), *long_drive(60.0)]
-    found = read(write(tmp_path / "a.record.00000", sent), window_s=20.0)
-    egos = [one for made in found for one in made.tracks if one.id.startswith("ego")]
-    assert len(found) == len(egos) == 3
-    assert not any(ego.is_human(ego.t[0], ego.t[-1]) for ego in egos)

@@ -75,22 +75,6 @@ def test_columns_that_may_be_missing_and_the_test_split(tmp_path):
     assert max(track.t[-1] for track in recording.tracks) == pytest.approx(4.9)
 
 
-def test_stamps_that_are_not_10_hz_are_noted(tmp_path):
-    table = w.columns()
-    table["end_timestamp"] = [w.START_NS + 4.9e9] * len(table["timestep"])
-    recording = scenario(tmp_path, table=table)
-    assert any("0.1 s assumed" in note for note in recording.notes)
-    assert recording.tracks[0].t[-1] > 5.0
-
-
-def test_lane_without_length_is_left_out(tmp_path):
-    lanes = w.vector_map()
-    for side in ("left", "right"):
-        lanes["lane_segments"]["205119002"][f"{side}_lane_boundary"] = [w.POINT] * 2
-    recording = scenario(tmp_path, lanes=lanes)
-    assert any("1 lanes without length" in note for note in recording.notes)
-
-
 def test_scenario_id_does_not_lead_out_of_the_folder(tmp_path):
     table = w.columns()
     table["scenario_id"] = ["/../../secret"] * len(table["timestep"])

@@ -9,7 +9,6 @@ from defusedxml import ElementTree
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.quality import assumed
 from rcirl_jax.types import Kind
 from tests.data.formats import writers as w
 from tests.helpers import logs
@@ -80,17 +79,6 @@ def test_lane_geometry_from_unequal_bounds(tmp_path):
     assert (lane.left_width > 0.0).all()
 
 
-def test_lane_references(tmp_path):
-    links = (
-        '<successor ref="2"/><successor ref="77"/>'
-        '<adjacentLeft ref="3" drivingDir="opposite"/>'
-        '<adjacentRight ref="2" drivingDir="same"/>'
-    )
-    parts = (w.lanelet("1", extra=links), w.lanelet("2"), w.lanelet("3"), w.car())
-    lane = scenario(tmp_path, *parts).lanes[0]
-    assert (lane.successors, lane.left, lane.right) == (("2",), None, "2")
-
-
 def test_speed_limits(tmp_path):
     signs = ("50", 13.4112), ("51", 3.5763)
     recording = scenario(
@@ -132,16 +120,6 @@ def test_limits_of_countries(tmp_path):
             assert lane.speed_limit == 8.33, (name, kind)
     for kind in ("R1-1", "206", "r2", "R27", "B5", "AB4", "2.5", "B02"):
         assert of_sign(tmp_path, "", kind, None, "<stopLine>").lanes[0].stop_sign
-
-
-def test_a_number_on_an_unknown_sign_is_noted(tmp_path):
-    """Croatia's B14 limits the mass, in tons; Germany's 262 does so everywhere."""
-    for country, kind in (("HRV", "B14"), ("", "Z9")):
-        made = of_sign(tmp_path, country, kind)
-        assert made.lanes[0].speed_limit is None
-        assert any(f"unknown id: 1 {kind}" in note for note in made.notes)
-        assert assumed(made)["speed limit"] == 1
-    assert not any("unknown id" in note for note in of_sign(tmp_path, "", "262").notes)
 
 
 def test_stop_lines_signs_and_lights(tmp_path):
@@ -279,7 +257,3 @@ def test_intervals_become_midpoints(tmp_path):
     ]
     made = scenario(tmp_path, w.lanelet(), w.car(states=states))
     np.testing.assert_allclose(made.tracks[0].speed, 15.0)
-
-
-def test_inactive_light_is_off(tmp_path):
-    assert set(lit(tmp_path, [("red", 9)], active="false").state) == {"off"}

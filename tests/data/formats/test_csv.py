@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.formats.lanes import StraightLane, straight_lanes
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import spec_root
 from rcirl_jax.types import Kind
@@ -201,16 +200,6 @@ def test_recorded_ngsim_subset_in_si(data_dir, tmp_path):
         for track in recording.tracks:
             if track.t.size > 20:
                 assert np.median(np.abs(track.heading)) < 0.1
-
-
-def test_straight_lanes_longer_than_roads_are_not_made(tmp_path):
-    found = [
-        StraightLane(id=f"{k}", y=4.0 * k, lower=0.0, upper=9.9e5) for k in range(11)
-    ]
-    lanes = straight_lanes(tmp_path, found[:1], 4.0, None)
-    assert len(lanes[0].centre) > 1e5
-    with pytest.raises(InputError, match=r"lanes: 1\.089e\+07 m long in all: expected"):
-        straight_lanes(tmp_path, found, 4.0, None)
 
 
 def test_far_coordinates_get_a_local_origin(tmp_path):

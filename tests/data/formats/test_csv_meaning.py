@@ -51,14 +51,6 @@ def test_the_projection_is_true_to_length_and_north():
             assert compass == pytest.approx(azimuth, abs=0.01)
 
 
-def test_headings_of_noise_keep_the_usual_convention(tmp_path):
-    rng = np.random.default_rng(0)
-    noisy = lambda heading: heading + rng.normal(0.0, 0.15)  # noqa: E731
-    path = write(tmp_path, people.column(people.rows(0.75), "heading", noisy))
-    found = people.only(path, people.spec(tmp_path, units='heading = "rad"'))
-    assert not any("headings" in note for note in found.notes)
-
-
 # ------------------------------------------------------------------------- flags
 
 FLAGS = [
@@ -214,12 +206,3 @@ def test_a_log_that_lies_twice_in_a_folder_is_read_once(tmp_path):
     found = people.read(tmp_path, people.spec(tmp_path, more=more))
     assert [made.name for made in found] == ["log", "other"]
     np.testing.assert_allclose(found[0].tracks[0].x, found[1].tracks[0].x, atol=1e-3)
-
-
-def test_a_row_of_numbers_is_no_line_of_units(tmp_path):
-    """Nor is one in which the first cells are unknown."""
-    table = people.rows()
-    table[0][2:7] = ["NaN"] * 5
-    found = people.only(people.write(tmp_path, table), people.spec(tmp_path))
-    assert people.rows_of(found)[0] >= 719
-    assert [track.t.size for track in found.tracks] == [119, *[120] * 5]

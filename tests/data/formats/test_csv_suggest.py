@@ -12,7 +12,7 @@ from rcirl_jax.data.formats.csv.suggest import suggested
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml
 from tests.data.formats import people
-from tests.data.formats.test_csv_meaning import pneuma, wide_frames
+from tests.data.formats.test_csv_meaning import wide_frames
 from tests.data.formats.test_csv_rows import digits
 from tests.data.formats.test_csv_ways import degrees
 from tests.helpers.commands import command
@@ -81,15 +81,6 @@ def test_the_rate_of_frames_by_the_speeds(tmp_path, rate, unit, factor):
         np.testing.assert_allclose(np.diff(track.t), 1.0 / rate, atol=1e-6)
 
 
-def test_raw_degrees_are_one_line(tmp_path):
-    header = [*people.HEADER[:2], "lon", "lat", *people.HEADER[4:]]
-    path = people.write(tmp_path, degrees(people.rows(), "{:.0f}", 1e7), header)
-    with pytest.raises(
-        InputError, match=r"lat: 3797\d+: expected degrees; .* \[scale\]"
-    ):
-        suggested(path)
-
-
 def test_units_in_a_line_below_the_header(tmp_path):
     table = people.rows()
     for name in ("x", "y", "length"):
@@ -149,16 +140,6 @@ def test_a_row_per_frame(tmp_path):
     }  # fmt: skip
     assert len(made.tracks) == 7
     assert any("a row per frame" in line for line in found.lines)
-
-
-def test_a_row_per_vehicle(tmp_path):
-    path = tmp_path / "pneuma.csv"
-    path.write_text(pneuma())
-    found, toml, (made,) = taken(path)
-    assert toml["columns"]["lon"] == "lon"
-    assert toml["units"]["speed"] == "km/h"
-    assert len(made.tracks) == 6
-    assert any("a row per road user, which repeats lat, lon" in x for x in found.lines)
 
 
 # header of a known tool, with the field that each column is
@@ -235,15 +216,6 @@ def test_times_of_day_as_digits(tmp_path, start, unit, is_open):
     assert toml["defaults"]["rate_hz"] == 10.0
     line = "not known: units.t: ms, or HHMMSSmmm of times of day?"
     assert (line in found.lines) == is_open
-    people.assert_same(made)
-
-
-@pytest.mark.parametrize("first", [1_717_142_694_000, 90_061_000])
-def test_milliseconds_are_no_times_of_day(tmp_path, first):
-    table = people.column(people.rows(), "t", lambda t: first + round(1000 * t))
-    found, toml, (made,) = taken(people.write(tmp_path, table))
-    assert toml["units"]["t"] == "ms"
-    assert not any("HHMMSS" in line for line in found.lines)
     people.assert_same(made)
 
 

@@ -1,7 +1,6 @@
 """L5 prediction data: scenes, semantic map, lights, malformed arrays."""
 
 import functools
-import json
 import shutil
 
 import numpy as np
@@ -47,17 +46,6 @@ def dataset(tmp_path):
 
 
 # --------------------------------------------------------------------- scenes
-
-
-def test_groups_of_other_hosts_and_days():
-    scenes = np.zeros(4, fixture.SCENE_DTYPE)
-    scenes["host"] = ["a", "b", "a", "a"]
-    scenes["start_time"] = np.array([0, 0, 30, 300]) * 10**9
-    scenes["end_time"] = scenes["start_time"] + 25 * 10**9
-    expected = ["a-from-0", "b-from-0", "a-from-0", "a-from-300"]
-    assert l5.groups_of(scenes, []) == expected
-    # the third scene alone is still one of the drive that began with the first
-    assert l5.groups_of(scenes[2:], [scenes[:1]]) == ["a-from-0", "a-from-300"]
 
 
 def test_groups_over_datasets(folder):
@@ -173,70 +161,7 @@ def test_light_of_a_lane(whole):
     np.testing.assert_allclose(signal.start, [0.0, green], atol=1e-6)
 
 
-def test_without_a_map_of_the_place_lanes_are_paths(dataset):
-    (recording,) = read(dataset.parent)
-    assert recording.signals == ()
-    assert recording.lanes[0].id.startswith("lane-")
-    assert any("estimated from all tracks" in note for note in recording.notes)
-    matrix = fixture.WORLD_TO_ECEF.copy()
-    matrix[:3, 3] += 1e5
-    beside = dataset.with_name("meta.json")
-    beside.write_text(json.dumps({"pose_to_ecef": matrix.tolist()}))
-    fixture.write_map(beside.with_name("semantic_map.pb"))
-    assert read(dataset.parent)[0].lanes[0].id.startswith("lane-")
-    beside.unlink()
-    beside.with_name("semantic_map.pb").rename(dataset.parent / "palo.pb")
-    assert len(read(dataset.parent, map="palo.pb")[0].lanes) == 4
-
-
 # ------------------------------------------------------------------- arrays
-
-BAD_METADATA = [
-    ({"shape": [2, 3]}, "shape: [2, 3]: expected a list"),
-    ({"shape": [10**12]}, "shape[0]: 1000000000000: expected a whole number <= "),
-    ({"chunks": [0]}, "chunks: 0: expected"),
-    ({"chunks": [10**9]}, "chunks: 1000000000: expected 1 to"),
-    ({"dtype": "<f8"}, "dtype: <f8: expected a list"),
-    ({"filters": [{"id": "pickle"}]}, "filters: "),
-    ({"compressor": {"id": "zlib"}}, "compressor.id: zlib: "),
-    (["centroid", "|O"], "dtype: ['centroid', '|O']: expected [name, little-endian"),
-    (["centroid", ">f8", [2]], "dtype: ['centroid', '>f8', [2]]: expected [name, "),
-    (["centroid", "<f8", [3]], "dtype: centroid: ('<f8', (3,)): expected shape (2,)"),
-    (["centroid", "<f8", [2**40]], "dtype"),
-    (["middle", "<f8", [2]], "dtype: centroid: missing"),
-    (["yaw", "<f8", [2]], "expected fields of different names"),
-]
-
-
-@pytest.mark.parametrize(("change", "words"), BAD_METADATA)
-def test_malformed_metadata(dataset, change, words):
-    """Other fields, or another first field of a record."""
-    file = dataset / "agents" / ".zarray"
-    found = json.loads(file.read_text())
-    if isinstance(change, dict):
-        found.update(change)
-    else:
-        found["dtype"][0] = change
-    file.write_text(json.dumps(found))
-    line = refused(read, dataset)
-    assert line.startswith(f"{file}: ")
-    assert words in line
-
-
-@pytest.mark.parametrize(
-    ("place", "content", "words"),
-    [
-        # blosc's own size is compared with the metadata before it is unpacked
-        (4, b"\xff\xff\xff\x7f", "0: chunk: [9817, 2147483647] bytes"),
-        (16, b"\xff" * 184, ": records 0 to "),
-    ],
-)
-def test_damaged_chunk(dataset, place, content, words):
-    chunk = dataset / "agents" / "0"
-    changed = bytearray(chunk.read_bytes())
-    changed[place : place + len(content)] = content
-    chunk.write_bytes(changed)
-    assert words in refused(read, dataset)
 
 
 def test_format_version_1_has_no_lights(folder):

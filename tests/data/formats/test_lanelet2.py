@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.formats.lanelet2.map import read_lanelet2
-from rcirl_jax.data.formats.projection import utm, utm_zone
+from rcirl_jax.data.formats.projection import utm
 from tests.data.formats.fixtures import osm
 from tests.helpers.logs import refused
 
@@ -30,21 +30,6 @@ def metres(folder, **options):
 @pytest.fixture
 def lanes(tmp_path):
     return read(metres(tmp_path))[0]
-
-
-@pytest.mark.parametrize(
-    ("latitude", "longitude", "zone", "expected"),
-    [
-        # PROJ 9, proj=utm ellps=WGS84
-        (50.78505, 6.13070, 32, (297750.42422433326, 5629847.200410632)),
-        (50.9907, 6.9001, 32, (352628.22689050355, 5650889.601443835)),
-        (0.0, 0.0, 31, (166021.44308054057, 0.0)),
-    ],
-)
-def test_utm_against_proj(latitude, longitude, zone, expected):
-    assert utm_zone(longitude) == zone
-    found = utm(np.array([latitude]), np.array([longitude]), zone)
-    np.testing.assert_allclose(found[0], expected, atol=1e-6)
 
 
 def test_geometry_and_direction(lanes):
@@ -127,19 +112,6 @@ def test_speed_limits(tmp_path, monkeypatch, text, expected):
     else:
         assert lanes["30001"].speed_limit == pytest.approx(expected)
     assert lanes["30007"].speed_limit is None
-
-
-@pytest.mark.parametrize(
-    ("tags", "rules"), [({"speed_limit": "30"}, []), ({}, ["50000", "50002"])]
-)
-def test_the_limit_of_the_lane_itself_or_of_the_last_rule(
-    tmp_path, monkeypatch, tags, rules
-):
-    slow = ({"subtype": "speed_limit", "sign_type": "de274-30"}, [])
-    monkeypatch.setitem(osm.RULES, "50002", slow)
-    one = {"1": (["middle_3"], ["border_3"], {**osm.ROAD, **tags}, rules)}
-    lanes, _ = read(metres(tmp_path, lanelets=one))
-    assert lanes["1"].speed_limit == pytest.approx(30 / 3.6)
 
 
 def test_stop_sign_and_its_line(lanes):

@@ -5,7 +5,6 @@ import functools
 import numpy as np
 import pytest
 
-from rcirl_jax.data.formats.levelx import reader
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.types import Kind
@@ -70,23 +69,6 @@ def test_speed_limit(motorway, text, lane, default):
     recording = only(motorway)
     assert recording.lanes[0].speed_limit == lane
     assert recording.default_speed_limit == default
-
-
-def test_marked_lanes_longer_than_roads_are_not_made(tmp_path):
-    sides = {"upper": -4.0 * np.arange(7), "lower": -4.0 * np.arange(7, 14)}
-
-    def lanes(upper):
-        rows = {"x": np.array([0.0, upper]), "y": np.zeros(2), "vx": np.ones(2)}
-        return reader._marked_lanes(tmp_path, sides, rows, None)
-
-    assert len(lanes(400.0)) == 12
-    assert "lanes: 1.18812e+07 m long in all" in refused(lanes, 9.9e5)
-
-
-def test_many_markings_are_read_in_full(motorway):
-    marks = ";".join(f"{8.51 + 4.0 * k:.20f}" for k in range(4))
-    edit(motorway / "01_recordingMeta.csv", "8.51;12.59;16.43", marks)
-    assert len(only(motorway).lanes) == 5
 
 
 # -------------------------------------------------------------- inD and sisters
@@ -215,16 +197,3 @@ def test_truncated_at_the_border_of_lines(junction, tmp_path, kept, found):
     assert (f"{lost} tracks of tracksMeta have no rows" in recording.notes) == (
         lost > 0
     )
-
-
-def test_classes(junction):
-    """A class that nobody knows is a vehicle, and a note says so."""
-    meta = junction / "data" / "07_tracksMeta.csv"
-    edit(meta, ",truck_bus", ",Truck_Bus")
-    assert not any("classes" in note for note in only(junction).notes)
-    edit(meta, ",car", ",animal")
-    edit(meta, ",car", ",tram")
-    recording = only(junction)
-    kinds = [track.kind for track in recording.tracks[:2]]
-    assert kinds == [Kind.PEDESTRIAN, Kind.VEHICLE]
-    assert "classes taken for vehicles: tram" in recording.notes

@@ -132,19 +132,6 @@ def periods():
     return rows
 
 
-def test_separators_between_thousands(tmp_path):
-    """A spreadsheet's export: "1,118,846,979,700" and "2,224"."""
-    rows = periods()
-    sites = ["us-101"] * len(rows)
-    plain = only(w.ngsim_csv(tmp_path / "a.csv", rows, sites=sites))
-    assert "800,003," in w.grouped(tmp_path / "a.csv").read_text()
-    assert digest(only(tmp_path / "a.csv")) == digest(plain)
-    logs.edit(tmp_path / "a.csv", '"800,003,', '"800,03,')
-    source = w.strict(tmp_path / "strict.toml", "ngsim")
-    line = logs.refused(read, tmp_path / "a.csv", source)
-    assert "a.csv: line 113: Global_Time: '800,03," in line
-
-
 def test_release_with_every_log_twice(tmp_path):
     """Text and CSV of one name are one log; other tables are none."""
     for site, period in (("us-101", "0750am-0805am"), ("i-80", "0400-0415")):
@@ -191,40 +178,6 @@ def test_stamped_rows_may_come_in_any_order(tmp_path, writer):
     assert [track.id for track in whole.tracks] == names
     assert whole.tracks[2].t[0] == 3600.0
     assert whole.start_s == pytest.approx(1e-3 * min(row[3] for row in rows))
-
-
-ROWS = w.ngsim_rows()
-
-
-def with_cell(column, value):
-    row = [*ROWS[4][:column], value, *ROWS[4][column + 1 :]]
-    return [*ROWS[:4], row, *ROWS[5:]]
-
-
-@pytest.mark.parametrize(
-    ("rows", "line", "field"),
-    [
-        (with_cell(5, "nan"), 5, "Local_Y: 'nan'"),
-        (with_cell(11, "fast"), 5, "v_Vel: 'fast'"),
-        ([*ROWS, [1, 2, 3]], 41, "3 cells"),
-        ([row[:-1] for row in ROWS], 1, "17 cells"),
-        ([*ROWS[:10], *ROWS[12:], *ROWS[10:12]], None, "id 1: t: 10 after 39"),
-        (
-            [*ROWS[:4], [*ROWS[3][:5], 99.0, *ROWS[3][6:]], *ROWS[4:]],
-            *(5, "id 1: met twice in one frame"),
-        ),
-        ([[*r[:11], 9.9 * r[11], *r[12:]] for r in ROWS], None, "speed"),
-        ([[r[0], 3 * r[1], *r[2:]] for r in ROWS], None, "t: median step 3"),
-    ],
-)
-@pytest.mark.parametrize("writer", [w.ngsim_text, w.ngsim_csv])
-def test_malformed_rows(tmp_path, writer, rows, line, field):
-    path = writer(tmp_path / "bad.txt", rows)
-    header = writer is w.ngsim_csv
-    expected = field if line is None else f"line {line + header}: {field}"
-    message = logs.refused(read, path)
-    assert message.startswith(str(path))
-    assert expected in message
 
 
 @pytest.mark.dataset

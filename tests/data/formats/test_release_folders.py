@@ -1,7 +1,5 @@
 """Folders as they are after unpacking a release: logs at any depth, other files."""
 
-import shutil
-
 import pytest
 
 from rcirl_jax.data.formats import parts, read_part, read_recordings
@@ -13,7 +11,6 @@ from tests.data.formats.fixtures import (
     interaction,
     interaction_challenge,
     modules,
-    nuplan,
     openacc,
 )
 
@@ -80,18 +77,6 @@ def test_openacc_tables_that_are_no_drives(tmp_path):
         names("openacc", tmp_path)
 
 
-def test_a_copy_of_a_nuplan_log_is_in_the_group_of_the_log(tmp_path):
-    log = nuplan.write(tmp_path).files[0]
-    copy = tmp_path / "cache" / "other" / log.name
-    copy.parent.mkdir(parents=True)
-    shutil.copy(log, copy)
-    shutil.copy(log, copy.with_name("other.db"))
-    groups = {one.name: one.group for one in read_recordings("nuplan", tmp_path)}
-    drive = "2021.06.14.21.57.33_veh-38"
-    assert groups == dict.fromkeys(groups, drive) | {"other": "other"}
-    assert len(groups) == 3
-
-
 def test_sumo_beside_commonroad(tmp_path):
     """An interactive scenario's folder, with SUMO's header of generated files."""
     w.commonroad(tmp_path / "DEU_A9-1_1_I-1.cr.xml")
@@ -103,16 +88,6 @@ def test_sumo_beside_commonroad(tmp_path):
     (tmp_path / "broken.xml").write_text("<scenario/>")
     with pytest.raises(InputError, match=r"broken\.xml: root: 'scenario': expected"):
         names("commonroad", tmp_path)
-
-
-def test_the_invented_scenario_of_interactions_scripts(tmp_path):
-    """The data set unpacked into a clone of the repository of its tools."""
-    users = interaction.road_users()
-    for name in (".TestScenarioForScripts", "DR_A"):
-        interaction.write_scene(tmp_path / "recorded_trackfiles" / name, users)
-    assert names("interaction", tmp_path) == ["DR_A-000"]
-    alone = tmp_path / "recorded_trackfiles" / ".TestScenarioForScripts"
-    assert names("interaction", alone) == [".TestScenarioForScripts-000"]
 
 
 @pytest.mark.parametrize("writer", [interaction, interaction_challenge])

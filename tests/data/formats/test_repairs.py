@@ -7,7 +7,7 @@ import pytest
 from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.formats.tracks import of_one_name, once_each
 from tests.data.formats import writers as w
-from tests.data.formats.fixtures import argoverse2, waymo
+from tests.data.formats.fixtures import waymo
 from tests.data.formats.test_conformance import format_of, write
 from tests.helpers import logs
 
@@ -27,15 +27,6 @@ def test_rows_of_one_time_count_once():
     for ids in (np.zeros(204, int), np.arange(204)):  # many of them, and none
         kept, notes = once_each(ids, np.repeat(t[:102], 2))
         assert (kept.size, notes) == (204, [])
-
-
-def test_a_scenario_of_argoverse(tmp_path):
-    fixture = argoverse2.write(tmp_path)
-    whole = logs.only("argoverse2", fixture.input)
-    argoverse2.cells("timestep", 2, argoverse2.ONE)(fixture)
-    made = logs.only("argoverse2", fixture.input)
-    assert has_note(made, "1 states of a road user met twice")
-    assert [t.id for t in made.tracks] == [t.id for t in whole.tracks]
 
 
 def test_tracks_of_one_id(tmp_path):

@@ -1,16 +1,12 @@
 """ROS 2 bags: messages, lights, lanes, storages, and files that are refused."""
 
-import contextlib
 import functools
 import math
-import sqlite3
-import sys
 
 import numpy as np
 import pytest
 import zstandard
 from mcap.reader import make_reader
-from mcap.writer import CompressionType
 from mcap.writer import Writer as PlainWriter
 
 from rcirl_jax.types import Kind
@@ -338,17 +334,6 @@ def test_detections_seen_by_an_ego_that_turned(tmp_path):
     assert has_note(made, "9 obstacle states left out, while the ego's place was")
 
 
-def test_detections_without_an_id_or_of_an_unknown_class(tmp_path):
-    kind = "vision_msgs/Detection3DArray"
-    where = f"{tmp_path / 'a.mcap'}: {OBJECTS}: message 0: detections[0]"
-    messages = seen(functools.partial(detections, name=""), kind)
-    line = line_of(tmp_path, [*ego(), *messages])
-    assert line.startswith(f"{where}.id: '': expected one that stays with a road user")
-    messages = seen(functools.partial(detections, named="zebra"), kind)
-    line = line_of(tmp_path, [*ego(), *messages])
-    assert line.startswith(f"{where}: object_type: zebra: expected one of car, truck")
-
-
 # -------------------------------------------------------------- lights and lanes
 
 
@@ -376,13 +361,6 @@ def test_lights_govern_the_lane_at_their_place(tmp_path):
     assert lane.signal_ids == ("1034",)
     np.testing.assert_allclose(lane.stop_line, [[60.0, 1.75], [60.0, -1.75]], atol=0.01)
     assert has_note(made, "light 7: no lane within 3 m")
-
-
-@pytest.mark.parametrize("given", ["north", [[1.0]], [[1.0, float("nan")]], [], {}])
-def test_places_of_lights_that_are_none(tmp_path, given):
-    for lights in ({"1034": given}, {"north": [[1.0, 2.0]]}):
-        line = line_of(tmp_path, ego(), **ALONE, lights=lights)
-        assert line.startswith(f"source TOML: lights.{next(iter(lights))}: ")
 
 
 def test_lanes_of_a_lanelet2_map(tmp_path):
@@ -507,36 +485,6 @@ def test_other_encodings_and_definitions(tmp_path, capsys):
     assert capsys.readouterr() == ("", "")
 
 
-def test_files_that_were_never_closed(tmp_path):
-    file = fixture.mcap(tmp_path / "a.mcap", ego())
-    content = file.read_bytes()
-    for size in (len(content) - 1, len(content) // 2, 12, 8):
-        file.write_bytes(content[:size])
-        line = line_of(file, **ALONE)
-        assert line.startswith(f"{file}: no end after {size} bytes: expected a whole")
-        assert "`mcap recover FILE -o NEW`" in line
-    file.write_bytes(b"MCAP")
-    assert line_of(file, **ALONE).startswith(f"{file}: begins with b'MCAP': expected")
-
-
-def test_a_chunk_with_a_wrong_byte(tmp_path):
-    file = fixture.mcap(tmp_path / "a.mcap", ego(), compression=CompressionType.NONE)
-    content = bytearray(file.read_bytes())
-    content[content.index(b"base_link", 2000)] ^= 1
-    file.write_bytes(content)
-    line = line_of(file, **ALONE)
-    assert line.startswith(f"{file}: CRCValidationError: ")
-    assert "`mcap doctor FILE` says what is wrong" in line
-
-
-def test_without_the_extra(tmp_path, monkeypatch):
-    file = fixture.mcap(tmp_path / "a.mcap", ego())
-    monkeypatch.setitem(sys.modules, "mcap.reader", None)
-    line = line_of(file, **ALONE)
-    assert line.startswith("mcap.reader: not installed ")
-    assert line.endswith("expected pip install 'rcirl-jax[ros2]'")
-
-
 def test_values_of_messages(tmp_path):
     """The line names file, topic, message and field."""
 
@@ -574,33 +522,6 @@ def test_lights_of_the_older_package(tmp_path):
     signal, _ = of_light(tmp_path, make, kind)
     assert signal.state == ("yellow", "off")
     np.testing.assert_allclose(signal.start, [0.0, 4.0], atol=1e-6)
-
-
-def test_lanes_of_a_table_beside_the_bag(tmp_path):
-    x, y = fixture.CENTRE
-    rows = [f"a,{x + k},{y},4.0" for k in (-10.0, 100.0)]
-    (tmp_path / "lanes.csv").write_text("\n".join(["id,x,y,width", *rows]) + "\n")
-    made = only(tmp_path, ego(), **ALONE, lanes={"file": "lanes.csv"})
-    (lane,) = made.lanes
-    np.testing.assert_allclose(lane.centre, [[-10.0, 0.0], [100.0, 0.0]])
-    np.testing.assert_allclose(lane.left_width, 2.0)
-    line = line_of(tmp_path, ego(), **ALONE, lanes={"file": "other.csv"})
-    assert "lanes.file: other.csv: expected this CSV beside the log" in line
-
-
-def test_a_topic_without_a_definition_is_noted(tmp_path):
-    """Where it need not be there; what says who drove is missed in words."""
-    bag = fixture.write(tmp_path).input / "drive" / "drive_0.mcap"
-    file = fixture.sqlite(tmp_path / "other.db3", bag)
-    with contextlib.closing(sqlite3.connect(file)) as database, database:
-        database.execute(
-            "DELETE FROM message_definitions WHERE topic_type LIKE '%ControlMode%'"
-        )
-    made = only(file)
-    assert {track.id for track in made.tracks} >= {"ego"}
-    (note,) = [note for note in made.notes if "not read" in note]
-    assert note.startswith("/vehicle/status/control_mode (autoware_vehicle_msgs/msg/")
-    assert note.endswith("who drove is not known")
 
 
 def test_metadata(tmp_path):

@@ -77,14 +77,6 @@ def car_with(rows=range(w.NUM_STEPS), key=7, user=None, **changes):
     return track
 
 
-def test_sizes_are_medians_and_small_ones_are_raised(tmp_path):
-    long = car_with(range(60, 91), length=9.0, width=0.15)
-    user = straight(w.T, (w.EAST, w.NORTH), 0.0, 1.0, size=(4.0, 0.15))
-    (one, other) = scenario(tmp_path, tracks=[long, car_with(key=8, user=user)]).tracks
-    assert (one.length, one.width) == (pytest.approx(4.5), pytest.approx(1.9))
-    assert (other.length, other.width) == (4.0, 0.2)
-
-
 @pytest.mark.parametrize(
     ("change", "rows", "wrong"),
     [
@@ -110,20 +102,6 @@ def test_up_to_a_tenth_of_the_tracks_may_be_impossible(tmp_path, change, rows, w
     assert len(scenario(tmp_path, tracks=traffic(5, 1)).tracks) == 4
     many = refused(scenario, tmp_path, tracks=traffic(20, 3))
     assert f"record 0: track 100: {wrong}" in many
-
-
-def test_far_coordinates_get_a_local_origin(whole, tmp_path, monkeypatch):
-    monkeypatch.setattr(w, "EAST", w.EAST + 50_000.0)
-    far = only(w.write(tmp_path).input)
-    assert "local origin at x = 58000 m, y = -3000 m" in far.notes
-    shift = np.array([-8000.0, 3000.0])
-    for a, b in zip(whole.tracks, far.tracks, strict=True):
-        moved = np.stack([b.x, b.y]) - np.stack([a.x, a.y])
-        np.testing.assert_allclose(moved, shift[:, None] * np.ones_like(moved))
-    for a, b in zip(whole.lanes, far.lanes, strict=True):
-        np.testing.assert_allclose(a.centre + shift, b.centre, atol=1e-6)
-        if a.stop_line is not None:
-            np.testing.assert_allclose(a.stop_line + shift, b.stop_line, atol=1e-6)
 
 
 # ------------------------------------------------------------------------ map
@@ -273,46 +251,5 @@ def test_records_are_read_one_by_one_up_to_a_limit(tmp_path):
     assert "gzip data: expected an uncompressed TFRecord file" in refused(read, path)
 
 
-def test_other_messages_are_refused(tmp_path):
-    """Of tf_example files, and of lidar_and_camera files: an id and laser data."""
-    example = w.classes({"tf": "Feature: key 1 string\nExample: features 1 .Feature*"})
-    feature = w.written(example.Example, features=[{"key": "scenario/id"}])
-    sensors = w.written(w.MESSAGES.Scenario, scenario_id="id", lidar=[bytes(900)])
-    for data in (feature, b"", sensors):
-        line = refused(read, put(tmp_path, data))
-        assert "expected Scenario messages" in line
-        assert "not tf_example/ or lidar_and_camera/" in line
-
-
-def test_notes_on_the_recording_car_and_shared_vehicles(whole):
-    assert (whole.name, whole.group, whole.rate_hz) == (w.SCENARIO, w.SCENARIO, 10.0)
-    assert "the recording car is track 2314" in whole.notes
-    assert {track.id for track in whole.tracks if track.automated} == {"2314"}
-    assert any("training_20s" in note for note in whole.notes)
-
-
-def test_two_heads_of_one_lane_and_a_lane_that_is_not_read(tmp_path):
-    """The first known one counts."""
-    row = w.shown(0, 3, 4)
-    row["lane_states"].append({"lane": 106, "state": 4, "stop_point": w.point(0, 0)})
-    signals = scenario(tmp_path, dynamic_map_states=[row] * 91).signals
-    assert {s.id: s.state for s in signals} == {"103": ("green",), "106": ("red",)}
-
-
-WIDE = [w.boundary(-(2**31), 2**31 - 1, 9)] * 50
-ROAD = [w.lane(1, w.eastward(0, 0, 50), left_boundaries=WIDE)]
 TWO = [w.shown(4)] * 91
 TWO = [{"lane_states": [*row["lane_states"], {"lane": 106, "state": 4}]} for row in TWO]
-LIMITS = [
-    ("reader.MAX_STATES", 545, {}, "tracks: 6 of 91 states: expected at most 545"),
-    ("map.MAX_POINTS", 1000, {"map_features": ROAD}, "left_boundaries: "),
-    ("map.MAX_COLOURS", 181, {"dynamic_map_states": TWO}, "2 lanes over 91 steps"),
-]
-
-
-@pytest.mark.parametrize(("name", "most", "changes", "words"), LIMITS)
-def test_limits(tmp_path, monkeypatch, name, most, changes, words):
-    monkeypatch.setattr(f"rcirl_jax.data.formats.waymo.{name}", most)
-    assert words in refused(scenario, tmp_path, **changes)
-    monkeypatch.setattr(f"rcirl_jax.data.formats.waymo.{name}", most * 50)
-    assert scenario(tmp_path, **changes).tracks

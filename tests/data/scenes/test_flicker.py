@@ -8,7 +8,7 @@ import pytest
 from rcirl_jax.data.quality import QualityReport, format_quality
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.scenes.tracks import JOINED, SHORT, SMALL, joined, steady_tracks
+from rcirl_jax.data.scenes.tracks import JOINED, SHORT, joined, steady_tracks
 from rcirl_jax.types import Kind
 from tests.helpers.roads import NO_FILTER, SERIES, WIDTH, car, recording, speeding_up
 
@@ -47,19 +47,6 @@ def test_a_minimum_life(begin, end, kept):
     assert counts == ({} if kept else {SHORT: 1})
     earlier = dataclasses.replace(made.tracks[1], seen_since=-4.0)  # in a longer log
     assert not steady_tracks(recording(EGO, earlier), CollectConfig())[1]
-
-
-def test_a_minimum_size():
-    tracks = [
-        dataclasses.replace(standing(f"{length}"), length=length, width=0.05)
-        for length in (0.1, 0.19, 0.2, 0.6)
-    ]
-    found, counts = steady_tracks(recording(EGO, *tracks), CollectConfig())
-    assert [track.id for track in found.tracks] == ["ego", "0.2", "0.6"]
-    assert counts == {SMALL: 2}
-    found, counts = steady_tracks(recording(*tracks), CollectConfig(min_size_m=0.0))
-    assert len(found.tracks) == 4
-    assert not counts
 
 
 def test_fragments_of_a_standing_body_are_one():

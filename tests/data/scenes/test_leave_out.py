@@ -10,12 +10,9 @@ from rcirl_jax.data.inputs import InputFile, recordings_of
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.recording import LEAVE_OUT
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.provenance import git_commit
 from tests.data.formats.fixtures import waymo
 from tests.data.small_logs import CONFIG, write_logs
-from tests.helpers import commands
 
 STRICT = ImportConfig(
     format="waymo",
@@ -100,24 +97,3 @@ def test_a_file_that_breaks_off_gives_what_it_has(tmp_path):
     assert made.count == rest.count > 0
     assert made.quality["refused"] == 1
     assert "logs/log01.csv, the rest" in made.recordings
-
-
-def test_the_command(tmp_path):
-    write_logs(tmp_path / "logs", files=3)
-    (tmp_path / "logs" / "log01.csv").write_text("t,id,x,y\nnothing\n")
-    flags = (f"--input={tmp_path / 'logs'}", f"--output={tmp_path / 'data'}")
-    flags = ("--format=csv", "--stride=1", *flags)
-    ends = commands.command("rcirl_jax", "import", *flags)
-    assert ends.returncode == 2
-    assert ends.stderr.strip().splitlines()[-1].startswith("error: ")
-    assert not (tmp_path / "data").exists()
-    flags = (*flags, "--leave_out=1", "--signals=pooled")  # which reads the logs too
-    done = commands.command("rcirl_jax", "import", *flags)
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert "1 recording refused and left out" in done.stdout
-    dataset = open_dataset(tmp_path / "data")
-    facts = dataset.facts()
-    assert facts["data_hash"] == dataset.hash
-    assert facts["made_by"]["flags"]["leave_out"] == "1"
-    assert facts["made_by"]["git_commit"] == git_commit()
-    assert [floor["candidates"] > 100 for floor in facts["oracle_floor"]] == [True] * 2

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.cli.flags import pooled_signals
-from rcirl_jax.data.inputs import input_files, recordings_of
+from rcirl_jax.data.inputs import input_files
 from rcirl_jax.data.scenes import signal_phases
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig, SignalChecks, signal_checks
@@ -19,7 +19,6 @@ from rcirl_jax.data.scenes.signal_phases import (
 )
 from rcirl_jax.runtime.executors import Processes, Serial
 from rcirl_jax.types import Kind, Lane, Recording, Signal, Track
-from tests.data.formats.fixtures import commonroad
 
 T = np.arange(0.0, 11.05, 0.1)  # s
 LENGTH_M, WIDTH_M, LANE_M = 4.6, 1.8, 3.6
@@ -113,20 +112,6 @@ def test_periods_and_who_stands_at_the_line():
     assert period(always) is None
     made = drives_of(1, 0.0)  # only the first of a queue does
     assert list(first_stands(made, made.lanes[1])) == [0]
-
-
-@pytest.mark.multiprocess
-def test_logs_are_checked_alike_wherever_they_are_read(tmp_path):
-    """And as their recordings are when they are all held at once."""
-    for number in range(3):
-        (tmp_path / str(number)).mkdir()
-        commonroad.write(tmp_path / str(number))
-    logs = input_files("commonroad", tmp_path)
-    made = [recording for part in logs for recording in recordings_of(part)]
-    assert len(made) == len(logs) == 3
-    for places in Serial(), Processes(2):
-        found = check_written(logs, executor=places)
-        assert repr(found) == repr(checked(made))  # a share of nothing is NaN
 
 
 def verdicts(made):

@@ -17,7 +17,7 @@ from rcirl_jax.data.store.batches import (
     epoch_order,
     split_batches,
 )
-from rcirl_jax.data.store.dataset import BLOCK_ROWS, JoinedDatasets, open_dataset
+from rcirl_jax.data.store.dataset import BLOCK_ROWS, open_dataset
 from tests.data.store.test_dataset import make_rows, write
 from tests.helpers.logs import refused
 
@@ -63,20 +63,6 @@ def test_restored_iterator_continues_to_the_bit(count, size, cut):
 
 
 @pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"batch_size": 0}, "batch_size: 0"),
-        ({"batch_size": 5, "num_shards": 2}, "batch_size: 5"),
-        ({"seed": -1}, "seed: -1"),
-        ({"indices": np.arange(0)}, "rows: 0"),
-    ],
-)
-def test_bad_settings(settings, words):
-    known = {"batch_size": 4, "seed": 0, **settings}
-    assert words in refused(BatchIterator, make_rows(6), **known)
-
-
-@pytest.mark.parametrize(
     "change", [{"seed": 1}, {"position": 2}, {"position": -1}, {"epoch": -1}]
 )
 def test_states_of_other_runs_are_refused(change):
@@ -110,16 +96,6 @@ class Recorded:
 def narrow(monkeypatch):
     """A window of three blocks, so that small data slide through it."""
     monkeypatch.setattr(pipeline, "WINDOW_BLOCKS", 3)
-
-
-def test_blocks_are_those_unpacked_together(dataset):
-    blocks = dataset.blocks(np.arange(sum(SIZES)))
-    sizes = [BLOCK_ROWS, 300 - BLOCK_ROWS, *SIZES[1:]]
-    assert np.bincount(blocks).tolist() == sizes
-    assert np.all(np.diff(blocks) >= 0)
-    joined = JoinedDatasets([dataset, dataset])
-    some = np.array([sum(SIZES), 0, sum(SIZES) - 1, 2 * sum(SIZES) - 1])
-    assert joined.blocks(some).tolist() == [7, 0, 6, 13]
 
 
 @given(

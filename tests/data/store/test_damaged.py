@@ -1,7 +1,6 @@
 """Damaged datasets, and those made to harm: one line that names the file."""
 
 import json
-import os
 import re
 import shutil
 
@@ -94,20 +93,6 @@ def test_crc32c_lets_no_wrong_row_through(copy):
     assert "shards/00002/scene.ego.s: cannot be read" in line
 
 
-@pytest.mark.parametrize("rows", [(40_000_000, 256), (40_000_000, 40_000_000)])
-def test_an_array_in_other_chunks_is_named(copy, rows):
-    """The blocks of a store are unpacked whole: a huge one would fill the memory."""
-    path = copy / "shards/00001/human.s/zarr.json"
-    meta = json.loads(path.read_text())
-    chunk, block = ([count, *meta["shape"][1:]] for count in rows)
-    chunk[0] -= chunk[0] % block[0]
-    meta["chunk_grid"]["configuration"]["chunk_shape"] = chunk
-    meta["codecs"][0]["configuration"]["chunk_shape"] = block
-    path.write_text(json.dumps(meta))
-    line = refused(open_dataset(copy, verify=False).indices, "train")
-    assert re.search(r"human.s: shard 1: chunks .*expected \(\(40", line)
-
-
 def reseal(folder, change_shard=None, change=None):
     """Change shard.json or manifest.json, and make the digests above it right."""
     mark, top = folder / "shards/00000/shard.json", folder / "manifest.json"
@@ -185,26 +170,3 @@ BAD_MANIFESTS = [
 def test_manifests_that_are_none(small, change, words):
     reseal(small, change=change)
     assert re.search(words, refused(open_dataset, small))
-
-
-def test_a_fifo_in_a_dataset_is_not_waited_for(small):
-    file = small / "shards/00000/human.s/c/0/0"
-    file.unlink()
-    os.mkfifo(file)
-    assert "human.s/c/0/0: expected a file" in refused(open_dataset, small)
-
-
-HUGE = [
-    *[("manifest.json", f"{2**30} at most"), ("made_by.json", f"{2**28} at most")],
-    ("shards/00000/shard.json", f"{2**28} at most"),
-    ("shards/00000/human.s/c/0/0", "at most"),
-]
-
-
-@pytest.mark.parametrize(("name", "words"), HUGE)
-def test_a_terabyte_in_a_dataset_is_not_read(small, name, words):
-    with (small / name).open("ab") as opened:
-        opened.truncate(2**40)
-    line = refused(lambda: open_dataset(small).facts())
-    assert re.search(rf"{name}: .*{2**40} bytes", line)
-    assert words in line

@@ -291,35 +291,3 @@ def test_a_vehicle_in_two_splits_is_refused(tmp_path):
     writer.write_shard(0, rows, [])
     assert "vehicle 7: in test and train" in refused(writer.finish, finish_fields())
     assert "interrupted" in refused(open_dataset, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("index", "change", "words"),
-    [
-        (1, lambda rows: rows, "shard 1: expected 0 next"),
-        (0, lambda rows: jax.tree.map(lambda x: x[:0], rows), "at least one row"),
-        (0, lambda rows: rows.replace(frame=rows.frame.astype(np.int64)),
-         r"frame: int64 \(6,\): expected int32"),
-        (0, lambda rows: rows.replace(decisions=rows.decisions[:, 1:]),
-         r"decisions: int32 \(6, 15\)"),
-    ],
-)  # fmt: skip
-def test_wrong_shards(tmp_path, index, change, words):
-    with pytest.raises(ValueError, match=words):
-        DatasetWriter(tmp_path).write_shard(index, change(make_rows(6)), [])
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"extra": 1}, "extra: unknown"),
-        ({"vehicles": ["v0"]}, r"vehicle: \d+ to \d+: 1 names"),
-        ({"splits": {"train": ["g0"], "test": ["g1"]}}, "every group exactly once"),
-    ],
-)
-def test_wrong_ends(tmp_path, changes, words):
-    writer = DatasetWriter(tmp_path)
-    writer.write_shard(0, make_rows(6), [])
-    with pytest.raises(ValueError, match=words):
-        writer.finish(finish_fields(**changes))

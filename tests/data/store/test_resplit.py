@@ -94,12 +94,6 @@ def test_folds_hold_out_every_scene_once():
         assert not set(train.recording) & set(test.recording)
 
 
-@pytest.mark.parametrize("count", [1, 5])
-def test_folds_need_recordings(count):
-    with pytest.raises(InputError, match=f"folds: {count}: expected 2 to 4"):
-        folds_by_recording(Rows(), count)
-
-
 class Tagged(Rows):
     """Every third scene changes lanes; in two training scenes somebody cuts in."""
 
@@ -121,16 +115,3 @@ def test_scenes_with_a_tag():
     assert set(found.indices("train")) < set(both)
     assert set(data.indices("train")[:2]) <= set(both)
     assert found.hash != data.hash
-
-
-@pytest.mark.parametrize(
-    ("tag", "words"),
-    [
-        ("lane_chnge", "lane_chnge: expected some of .*; did you mean lane_change"),
-        ("turning", r"turning: none of \d+ scenes of the split train has one"),
-        ("cut_in", r"cut_in: none of \d+ scenes of the split test has one"),
-    ],
-)
-def test_tags_that_select_nothing_are_one_line(tag, words):
-    with pytest.raises(InputError, match=f"tags: {words}"):
-        with_tags(Tagged(), [tag])

@@ -6,11 +6,9 @@ from hypothesis import strategies as st
 from rcirl_jax.data.store.splits import (
     WHOLES,
     assign_groups,
-    check_disjoint,
     split_wholes,
     time_blocks,
 )
-from rcirl_jax.errors import InputError
 
 COUNTS = st.dictionaries(
     st.text(min_size=1, max_size=6), st.integers(1, 500), min_size=2, max_size=30
@@ -47,34 +45,6 @@ def test_groups_are_whole_and_shares_off_by_the_largest_at_most(counts, fraction
 def test_against_the_rule_done_by_hand(counts, fraction, train, test):
     made = assign_groups(counts, test_fraction=fraction, seed=0)
     assert made == {"train": list(train), "test": list(test)}
-
-
-@pytest.mark.parametrize(
-    ("counts", "fraction", "words"),
-    [
-        ({"only": 5}, 0.25, "groups: 1"),
-        ({}, 0.25, "groups: 0"),
-        ({"a": 1, "b": 1}, 1.0, "test_fraction: 1.0"),
-        ({"a": 1, "b": 1}, float("nan"), "test_fraction: nan"),
-    ],
-)
-def test_bad_input_is_one_line(counts, fraction, words):
-    with pytest.raises(InputError, match=words) as caught:
-        assign_groups(counts, test_fraction=fraction, seed=0)
-    assert "\n" not in str(caught.value)
-
-
-@given(seed=st.integers(0, 10_000))
-def test_check_disjoint_against_sets(seed):
-    rng = np.random.default_rng(seed)
-    groups, vehicles = rng.integers(0, 4, 6), rng.integers(0, 12, 6)
-    split = {"train": [0, 1], "test": [2, 3]}
-    sides = [set(vehicles[groups < 2].tolist()), set(vehicles[groups >= 2].tolist())]
-    if sides[0] & sides[1]:
-        with pytest.raises(InputError, match=f"vehicle {min(sides[0] & sides[1])}:"):
-            check_disjoint(groups, vehicles, split)
-    else:
-        check_disjoint(groups, vehicles, split)
 
 
 def test_blocks_are_halved_until_none_holds_too_much():
