@@ -14,7 +14,7 @@ import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from rcirl_jax.data.formats.declared import with_numbers_and_texts
+from rcirl_jax.data.formats.declared import over_packaged
 from rcirl_jax.data.formats.files import log_name, with_log_names
 from rcirl_jax.data.formats.format import Format
 from rcirl_jax.data.formats.options import USER_KEYS, check_options
@@ -100,10 +100,11 @@ def parts(
     own = [] if source is None else sorted(spec)
     options = f"options as in the TOML of format {name}"
     if source is not None:
+        form, usual = format_of(name), load_toml(packaged)
         with as_input_error(str(source), options):
-            check_options(spec, load_toml(packaged), format_of(name))
-        if format_of(name).is_declared:
-            spec = with_numbers_and_texts(spec, load_toml(packaged))
+            check_options(spec, usual, form)
+        if name not in ("csv", "synthetic"):  # what they do not say is no default
+            spec = over_packaged(spec, usual, form.free)
     spec = {**spec, USER_KEYS: own}
     if input_path is None:
         if name != "synthetic":

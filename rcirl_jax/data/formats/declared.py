@@ -32,10 +32,19 @@ KINDS = {
 }  # class of a road user, in small letters -> what it is; others are vehicles
 
 
-def with_numbers_and_texts(spec: dict, packaged: Mapping) -> dict:
-    """Returns a user's source TOML, with the packaged one's numbers and texts."""
-    plain = (bool, int, float, str)
-    return {k: v for k, v in packaged.items() if isinstance(v, plain)} | spec
+def over_packaged(spec: dict, packaged: Mapping, free: Collection[str]) -> dict:
+    """Returns a user's source TOML, laid over the packaged one of its format.
+
+    Numbers, texts and names of files that it does not say are the packaged ones, also
+    those in tables, but for `free` tables, whose names are the user's.
+    """
+    made = dict(spec)
+    for key, value in packaged.items():
+        if isinstance(value, dict) and key not in free:
+            made[key] = {**value, **spec.get(key, {})}
+        elif isinstance(value, bool | int | float | str) or key == "pattern":
+            made.setdefault(key, value)
+    return made
 
 
 def open_log(

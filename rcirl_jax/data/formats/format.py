@@ -27,8 +27,6 @@ class Format:
     shard_bytes: int = 0
     # whether a part is a file that is read in pieces where it is long
     is_cut: bool = False
-    # whether the packaged TOML says what holds where a user's own says nothing
-    is_declared: bool = False
     # options besides those of its packaged TOML, each with a value of its type; an
     # option that is a table has a value for each of its own
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)

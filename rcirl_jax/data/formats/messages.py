@@ -11,7 +11,7 @@ import array
 import copy
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -33,9 +33,7 @@ from rcirl_jax.data.recording import MAX_RATE_HZ, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording, Track
 
-RATE_HZ = 10.0  # 1/s, of recordings
 MAX_GAP_S = 0.55  # s without a message inside one track
-WINDOW_S = 300.0  # s, longest window of a drive
 MIN_WINDOW_S = 1.0  # s that it may be; each window costs as much as its surroundings
 PIECE_S = 60.0  # s of recording after which rows are looked at
 LATE_S = 2.0  # s, messages of one time are recorded within it
@@ -74,9 +72,6 @@ class Drive(abc.ABC):
 
     widths: ClassVar[Mapping[str, int]]  # role -> number of columns
     obstacles: ClassVar[Sequence[str]] = ("obstacles",)  # the first with rows counts
-    # source, licence, and m/s where no lane says its limit
-    usual: ClassVar[tuple[str, str, float]]
-    car: ClassVar[Mapping[str, float]]  # measures, see `ego_boxes`
     stamp_field = "header.stamp"  # named in errors
     by_hand = "driven by hand"  # named in notes
     has_no_map = "no map given"
@@ -269,8 +264,7 @@ class Drive(abc.ABC):
 
     def recording(self, within: tuple[float, float]) -> Recording | None:
         """Makes the recording of all rows; its scenes begin within two times [s]."""
-        spec, (source, licence, limit) = self.spec, self.usual
-        others, notes = self._others()
+        spec, (others, notes) = self.spec, self._others()
         tracks = [*self._ego(), *others]
         if not any(t.t[0] < within[1] and t.t[-1] >= within[0] for t in tracks):
             return None
@@ -288,12 +282,12 @@ class Drive(abc.ABC):
             notes = ["no places of the ego recorded; no ego track", *notes]
         return Recording(
             name=self.name,
-            source=str(spec.get("source", source)),
-            licence=str(spec.get("licence", licence)),
+            source=spec["source"],
+            licence=spec["licence"],
             rate_hz=clock_rate(spec),
             start_s=self.start,
             origin=(float(origin[0]), float(origin[1])),
-            default_speed_limit=positive(spec, "speed_limit", limit),
+            default_speed_limit=positive(spec, "speed_limit"),
             notes=(*self.notes, *notes, *origin_notes(origin), *more),
             **{"tracks": tuple(tracks), **fields},
         )
@@ -311,7 +305,7 @@ class Drive(abc.ABC):
             order = np.flatnonzero(known)[np.argsort(clock[known], kind="stable")]
             measured = np.interp(t, clock[order], measured[order])
             speed = np.where(lost, measured, speed)
-        boxes = ego_boxes(self.spec, self.car, t, x, y, heading, speed)
+        boxes = ego_boxes(self.spec, t, x, y, heading, speed)
         return self._tracks(boxes, self._driver_spans())[0]
 
     def _driver_spans(self) -> tuple[tuple[float, float], ...]:
@@ -321,7 +315,7 @@ class Drive(abc.ABC):
         """
         clock, by_hand = self.clock("driver"), self.tables["driver"][:, 1]
         if not clock.size:
-            return recording_car({"recording_car": "human", **self.spec})
+            return recording_car(self.spec)
         order = np.argsort(clock, kind="stable")
         clock, other = clock[order], by_hand[order] == 0.0
         silent = np.diff(clock, append=np.inf) > MAX_SILENCE_S
@@ -357,13 +351,12 @@ class Drive(abc.ABC):
     ) -> tuple[list[Track], list[str]]:
         """Tracks of boxes on the recording's clock, with notes."""
         boxes = on_clock(boxes, clock_rate(self.spec), MAX_GAP_S)
-        unknown = str(self.spec.get("unknown", "auto"))
-        return tracks_of(self.path, boxes, MAX_GAP_S, unknown, automated)
+        return tracks_of(self.path, boxes, MAX_GAP_S, self.spec["unknown"], automated)
 
 
 def longest_window(spec: Mapping) -> float:
     """Returns the option `window_s` of a source TOML, s."""
-    window = number(spec, "window_s", WINDOW_S)
+    window = number(spec, "window_s")
     if window < MIN_WINDOW_S:
         raise InputError(
             f"source TOML: window_s: {window:g}: expected at least {MIN_WINDOW_S:g} s"
@@ -418,20 +411,18 @@ class Windows:
         return part.of_log(self.drive, made)
 
 
-def topics_of(
-    spec: Mapping, usual: Mapping[str, Sequence[str]]
-) -> dict[str, list[str]]:
-    """Returns role -> names of topics: those of the option `topics`, else usual ones.
+def topics_of(spec: Mapping, known: Collection[str]) -> dict[str, list[str]]:
+    """Returns role -> names of topics of the option `topics`.
 
     Raises:
-      InputError: a role that is not among the usual ones, or no list of names.
+      InputError: a role that is not known, or no list of names.
     """
     found = {}
-    for role, given in {**usual, **section(spec, "topics")}.items():
+    for role, given in section(spec, "topics").items():
         every = [given] if isinstance(given, str) else given
-        if role not in usual:
+        if role not in known:
             raise InputError(
-                f"source TOML: topics.{role}: unknown: expected {', '.join(usual)}"
+                f"source TOML: topics.{role}: unknown: expected {', '.join(known)}"
             )
         if not isinstance(every, list | tuple) or not {*map(type, every)} <= {str}:
             raise InputError(
@@ -443,7 +434,7 @@ def topics_of(
 
 def clock_rate(spec: Mapping) -> float:
     """Returns the option `rate_hz` [1/s] of recordings that are put onto a clock."""
-    rate = positive(spec, "rate_hz", RATE_HZ)
+    rate = positive(spec, "rate_hz")
     if rate > MAX_RATE_HZ:
         raise InputError(
             f"source TOML: rate_hz: {rate:g}: expected at most {MAX_RATE_HZ:g}"

@@ -77,7 +77,7 @@ def positive(spec: Mapping, key: str, default: float = math.nan) -> float:
 def recording_car(spec: Mapping) -> tuple[tuple[float, float], ...]:
     """Returns `Track.automated` of the recording car (option `recording_car`)."""
     spans = {"human": (), "automated": ((-math.inf, math.inf),)}
-    return spans[one_of(spec, "recording_car", spans, "automated")]
+    return spans[one_of(spec, "recording_car", spans, "human")]
 
 
 def lane_types(
@@ -94,24 +94,22 @@ def lane_types(
     return tuple(value)
 
 
-def patterns(spec: Mapping, default: Sequence[str]) -> tuple[str, ...]:
+def patterns(spec: Mapping, default: Sequence[str] = ()) -> tuple[str, ...]:
     """Returns the option `pattern`: one file name pattern or a list of them."""
     value = spec.get("pattern", list(default))
     found = [value] if isinstance(value, str) else value
     if not isinstance(found, list) or not found or not all(map(_is_pattern, found)):
         raise InputError(
-            f"source TOML: pattern: {value}: expected file names such as {default[0]}"
+            f"source TOML: pattern: {value}: expected file names such as *.csv"
         )
     return tuple(found)
 
 
-def one_pattern(spec: Mapping, default: str) -> str:
+def one_pattern(spec: Mapping) -> str:
     """Returns the option `pattern` of a format that has one only."""
-    found = patterns(spec, [default])
+    found = patterns(spec)
     if len(found) != 1:
-        raise InputError(
-            f"source TOML: pattern: {list(found)}: expected one such as {default}"
-        )
+        raise InputError(f"source TOML: pattern: {list(found)}: expected one")
     return found[0]
 
 

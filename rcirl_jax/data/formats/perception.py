@@ -16,7 +16,7 @@ from rcirl_jax.data.formats.options import USER_KEYS, number, positive, section,
 from rcirl_jax.data.formats.shapes import local_origin
 from rcirl_jax.data.formats.tracks import once_each, split_tracks
 from rcirl_jax.data.recording import LENGTH_RANGE_M, MAX_SPEED_MPS, WIDTH_RANGE_M
-from rcirl_jax.data.roads import WIDTH_M, roads_from_tracks
+from rcirl_jax.data.roads import roads_from_tracks
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Signal, Track
 
@@ -57,7 +57,6 @@ class Boxes:
 
 def ego_boxes(
     spec: Mapping,
-    usual: Mapping[str, float],
     t: np.ndarray,
     x: np.ndarray,
     y: np.ndarray,
@@ -67,9 +66,8 @@ def ego_boxes(
     """Makes boxes of the recording car, id "ego", from its poses.
 
     Args:
-      spec: source TOML; the table `ego` has the car's measures.
-      usual: where it has not: length, width, and how far ahead of a pose's place the
-        box's centre lies, m.
+      spec: source TOML; the table `ego` has the car's measures in m: length, width,
+        and how far ahead of a pose's place the box's centre lies.
       t: [n] s.
       x: [n] m.
       y: [n] m.
@@ -77,8 +75,9 @@ def ego_boxes(
       speed: [n] m/s; NaN: from the positions.
     """
     own = section(spec, "ego")
+    ahead_of = "centre_ahead" if "centre_ahead" in own else "rear_axle_to_centre"
     length, width, ahead = (
-        np.full(t.size, number(own, name, m)) for name, m in usual.items()
+        np.full(t.size, number(own, name)) for name in ("length", "width", ahead_of)
     )
     x, y = x + ahead * np.cos(heading), y + ahead * np.sin(heading)
     ids, kinds = np.zeros(t.size, np.int64), np.full(t.size, int(Kind.VEHICLE))
@@ -275,7 +274,7 @@ def fitted_lanes(
 
     Their limit is what the user's own TOML states, if it does.
     """
-    width = positive(spec, "lane_width_m", WIDTH_M)
+    width = positive(spec, "lane_width_m")
     roads = roads_from_tracks(tracks, width=width, limit=stated(spec, "speed_limit"))
     return roads.lanes, roads.note
 

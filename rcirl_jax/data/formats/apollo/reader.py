@@ -22,7 +22,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -60,11 +60,8 @@ PARSERS = parsers(SCHEMA)
 MANUAL = 0  # Chassis.DrivingMode of a human driver, COMPLETE_MANUAL
 # PerceptionObstacle.Type: UNKNOWN_UNMOVABLE, PEDESTRIAN, BICYCLE, VEHICLE
 KINDS = {2: Kind.STATIC, 3: Kind.PEDESTRIAN, 4: Kind.CYCLIST, 5: Kind.VEHICLE}
-LOCALIZATION = "/apollo/localization/pose"
 CLOCK_TOLERANCE_S = 1.0  # s, two topics' clocks differ by more: not one clock
 REPEAT_S = 1.5  # s; Apollo sends the routing in force again every second
-# Lincoln MKZ in mkz_example: 3.89 m before, 1.043 m behind the rear axle
-EGO = {"length": 4.933, "width": 2.11, "rear_axle_to_centre": 1.4235}  # m
 OBSTACLES = ("perception", "prediction")
 # role -> columns of its rows, as `Drive` has them, and the time of recording, s
 WIDTHS = {"ego": 6, "velocity": 3, "driver": 3, "perception": 10, "prediction": 10}
@@ -136,38 +133,17 @@ def _end(message: Message) -> Iterator[tuple[str, Row]]:
             yield "routing", (x, y)
 
 
-class Topic(NamedTuple):
-    """Messages that say the same, on the channels of all releases."""
-
-    message: str  # type, without its package
-    read: Callable[[Message], Iterator[tuple[str, Row]]]  # rows by role
-    channels: tuple[str, ...]
-
-
-TOPICS = {
-    "localization": Topic("LocalizationEstimate", _localization, (LOCALIZATION,)),
-    "chassis": Topic("Chassis", _chassis, ("/apollo/canbus/chassis",)),
-    "perception": Topic(
-        "PerceptionObstacles", _perceived, ("/apollo/perception/obstacles",)
-    ),
-    "prediction": Topic("PredictionObstacles", _predicted, ("/apollo/prediction",)),
-    "routing": Topic(
-        *("RoutingResponse", _end),
-        ("/apollo/routing_response", "/apollo/raw_routing_response"),
-    ),
-    "routing_history": Topic(
-        *("RoutingResponse", _end),
-        (
-            "/apollo/routing_response_history",
-            "/apollo/raw_rrouting_response_history",  # so spelt since Apollo 9
-        ),
-    ),
+# topic of the source TOML, with the channels of all releases -> type of its messages,
+# without its package, and what makes rows by role of one
+TOPICS: dict[str, tuple[str, Callable[[Message], Iterator[tuple[str, Row]]]]] = {
+    "localization": ("LocalizationEstimate", _localization),
+    "chassis": ("Chassis", _chassis),
+    "perception": ("PerceptionObstacles", _perceived),
+    "prediction": ("PredictionObstacles", _predicted),
+    "routing": ("RoutingResponse", _end),
+    "routing_history": ("RoutingResponse", _end),
     # since Apollo 9; who listens late is given the last of the history
-    "command": Topic(
-        "PlanningCommand",
-        lambda message: _end(message.lane_follow_command),
-        ("/apollo/planning/command", "/apollo/planning_command_history"),
-    ),
+    "command": ("PlanningCommand", lambda sent: _end(sent.lane_follow_command)),
 }
 
 
@@ -178,7 +154,7 @@ def parts(path: Path, spec: dict) -> list[Path]:
     """Lists the first file of each run of parts: runs can be read alone."""
     if path.is_file():
         return [path]
-    return first_parts(path, one_pattern(spec, "*.record*"))
+    return first_parts(path, one_pattern(spec))
 
 
 def files_of(first: Path) -> list[Path]:
@@ -210,8 +186,6 @@ class ApolloDrive(Drive):
 
     widths = WIDTHS
     obstacles = OBSTACLES
-    usual = ("Apollo cyber record", "unknown", 29.06)  # m/s, 65 mph
-    car = EGO
     stamp_field = "timestamp_sec"
     by_hand = "in COMPLETE_MANUAL"
     has_no_map = "records hold no map"
@@ -225,10 +199,9 @@ class ApolloDrive(Drive):
 
     def rows(self) -> Iterator[tuple[str, float, float, Row]]:
         """Yields the rows of all wanted messages in the order of recording."""
-        usual = {name: topic.channels for name, topic in TOPICS.items()}
         wanted = {
             channel: TOPICS[name]
-            for name, channels in topics_of(self.spec, usual).items()
+            for name, channels in topics_of(self.spec, TOPICS).items()
             for channel in channels
         }
         files, numbers, done = self.run.files, dict.fromkeys(wanted, 0), 0
@@ -243,23 +216,23 @@ class ApolloDrive(Drive):
             for file in files:
                 record = Record(file)
                 for channel, time, content in record.messages(wanted, count):
-                    topic = wanted[channel]
+                    kind, rows_of = wanted[channel]
                     where = f"{file}: {channel}: message {numbers[channel]}"
-                    kind = record.types.get(channel) or topic.message
-                    if kind.rpartition(".")[2] != topic.message:
+                    found = record.types.get(channel) or kind
+                    if found.rpartition(".")[2] != kind:
                         raise InputError(
-                            f"{where}: type {kind!a:.80}: expected {topic.message}"
+                            f"{where}: type {found!a:.80}: expected {kind}"
                         )
                     try:
                         check_size("message", content)
-                        message = PARSERS[topic.message](bytes(content))
+                        message = PARSERS[kind](bytes(content))
                     except DecodeError as error:
                         raise InputError(
                             f"{where}: {error}: expected an Apollo message"
                         ) from error
                     numbers[channel] += 1
                     recorded, share = time * 1e-9, min(done / total, 1.0)
-                    for role, row in topic.read(message):
+                    for role, row in rows_of(message):
                         yield role, recorded, share, (*row, recorded)
                 if not record.is_complete:
                     self.notes.append(f"{file.name} was never closed; read to its end")

@@ -70,7 +70,6 @@ MAX_CATEGORY = 3  # 0 fragment, 1 unscored, 2 scored, 3 focal track
 RECORDER = "AV"  # id of the recording car
 FRAGMENT = 0
 MAX_GAP_STEPS = 5.5  # missing steps bridged inside one track
-LIMIT_MPS = 15.65  # m/s, 35 mph
 MAX_FILE_BYTES = 64 * 1024**2  # bytes of a map; published ones have 0.1 to 1 MB
 LANE_TYPES = ("VEHICLE", "BUS", "BIKE")
 DRIVEN = ("VEHICLE", "BUS")  # read unless the source TOML says otherwise
@@ -78,8 +77,7 @@ DRIVEN = ("VEHICLE", "BUS")  # read unless the source TOML says otherwise
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """Lists the scenario files; each can be read alone."""
-    wanted = patterns(spec, [f"{PREFIX}*{SUFFIX}"])
-    return files_below(path, wanted, "scenario files")
+    return files_below(path, patterns(spec), "scenario files")
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
@@ -109,15 +107,15 @@ def _read_scenario(file: Path, spec: dict) -> Recording:
     lanes, lane_notes = _lanes(found[0], origin, spec)
     return Recording(
         name=name,
-        source=str(spec.get("source", "Argoverse 2 Motion Forecasting")),
-        licence=str(spec.get("licence", "unknown")),
+        source=spec["source"],
+        licence=spec["licence"],
         rate_hz=1.0 / STEP_S,
         start_s=float(table["start_timestamp"][0]) * 1e-9 + since,
         origin=(float(origin[0]), float(origin[1])),
         tracks=tracks,
         lanes=lanes,
         group=group,
-        default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
+        default_speed_limit=number(spec, "speed_limit"),
         notes=(*origin_notes(origin), *notes, *track_notes, *lane_notes),
     )
 
@@ -175,7 +173,7 @@ def _read_tracks(
     kept, notes = once_each(users, table["timestep"])
     table = {name: column[kept] for name, column in table.items()}
     category = table["object_category"]
-    least = number(spec, "min_category", FRAGMENT)
+    least = number(spec, "min_category")
     tracks, low, wild = [], 0, 0
     pieces = split_tracks(file, table["track_id"], table["timestep"], MAX_GAP_STEPS)
     for name, rows in pieces:

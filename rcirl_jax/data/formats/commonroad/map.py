@@ -16,7 +16,6 @@ from rcirl_jax.data.formats.shapes import fractions, lane_between, resample
 from rcirl_jax.data.readers.xml import Node
 from rcirl_jax.types import Lane
 
-MIN_LIMIT_MPS = 5.0  # m/s, where the source TOML says none; lower signs are artefacts
 # the country that a file's benchmarkID begins with -> its ids of limits and of stops
 LIMITS_AND_STOPS = {
     "ARG": ("R15", "R27"),
@@ -40,7 +39,7 @@ COUNTRY = 3  # letters
 
 def read_lanes(root: Node, spec: dict) -> tuple[tuple[Lane, ...], list[str]]:
     """Reads all lanelets of a file as lanes, and notes about what was ignored."""
-    limits, stops, notes = _signs(root, number(spec, "min_speed_limit", MIN_LIMIT_MPS))
+    limits, stops, notes = _signs(root, number(spec, "min_speed_limit"))
     nodes = root.each("lanelet")
     if not nodes:
         raise root.error("lanelet", "none", "a road network")

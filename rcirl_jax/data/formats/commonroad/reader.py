@@ -15,7 +15,7 @@ import numpy as np
 
 from rcirl_jax.data.formats.commonroad.map import read_lanes
 from rcirl_jax.data.formats.files import files_below, log_name
-from rcirl_jax.data.formats.options import is_file_name, one_pattern
+from rcirl_jax.data.formats.options import is_file_name, number, one_pattern
 from rcirl_jax.data.formats.shapes import arc_length
 from rcirl_jax.data.formats.tracks import of_one_name
 from rcirl_jax.data.readers.xml import Node, read_xml
@@ -28,7 +28,6 @@ GROUPS_UP = 4  # folders above a file in which the table of groups is looked for
 MAX_FILE_BYTES = 512 * 1024**2  # bytes, larger files are refused
 MAX_STEP = 1e6  # of the clock: a day at 10 Hz
 MAX_STANDING = 20_000_000  # samples of standing things: 500 over an hour at 10 Hz
-DEFAULT_LIMIT_MPS = 29.06  # m/s, 65 mph, where the source TOML names none
 # roots of what lies beside interactive scenarios: SUMO's files, solutions, other maps
 OTHER_ROOTS = (
     *("net", "routes", "additional", "configuration", "sumoConfiguration"),
@@ -61,7 +60,7 @@ KINDS = {
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """Lists the XML files but those of other formats; each can be read alone."""
-    files = files_below(path, one_pattern(spec, "*.xml"))
+    files = files_below(path, one_pattern(spec))
     if path.is_dir():
         files = [file for file in files if _root_of(file) not in OTHER_ROOTS] or files
     return files
@@ -82,7 +81,7 @@ def own_name(file: Path) -> str:
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """Yields one Recording per XML file."""
-    groups = _read_groups(path, spec.get("groups", ""))
+    groups = _read_groups(path, spec["groups"])
     for file in parts(path, spec):
         yield validate_recording(_read_file(file, spec, groups), file)
 
@@ -102,9 +101,9 @@ def _read_groups(path: Path, name: str) -> dict[str, str]:
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{table}: {error}: expected a CSV") from error
     found = [(row.get("file"), row.get("group")) for row in rows]
-    for number, pair in enumerate(found, 1):
+    for row, pair in enumerate(found, 1):
         if None in pair:
-            raise InputError(f"{table}: row {number}: {pair}: expected file,group")
+            raise InputError(f"{table}: row {row}: {pair}: expected file,group")
     return {str(file): str(group) for file, group in found}
 
 
@@ -124,11 +123,11 @@ def _read_file(path: Path, spec: dict, groups: dict[str, str]) -> Recording:
     last = max((float(track.t[-1]) for track in tracks), default=0.0)
     lanes, lane_notes = read_lanes(root, spec)
     limits = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
-    usual = float(spec.get("default_speed_limit", DEFAULT_LIMIT_MPS))
+    usual = [number(spec, "default_speed_limit")]
     # source and licence by the file's own source attribute
     source = about.get("source", "CommonRoad")
     rules = [r for r in spec.get("provenance", []) if r.get("match", "") in source]
-    rule = rules[0] if rules else {"licence": spec.get("licence", "unknown")}
+    rule = rules[0] if rules else {"licence": spec["licence"]}
     source = f"{source}: {rule['source']}" if "source" in rule else source
     group = groups.get(path.name)
     if group is None:
@@ -144,7 +143,7 @@ def _read_file(path: Path, spec: dict, groups: dict[str, str]) -> Recording:
         missing_agents=tuple(_missing_agents(root, dt, lanes)),
         group=path.stem if group is None else group,
         # of lanes without one: the median of the file's, if any
-        default_speed_limit=float(np.median(limits)) if limits else usual,
+        default_speed_limit=float(np.median(limits or usual)),
         notes=tuple(notes + lane_notes),
     )
 

@@ -69,14 +69,11 @@ FACES = {
     "traffic_light_face_status": ("f", (3,)),  # active, inactive, unknown
 }
 FACE_INTERVAL = "traffic_light_faces_index_interval"  # of frames
-RATE_HZ = 10.0  # 1/s
 SAME_DRIVE_S = 60.0  # s, a host's scenes closer than this may show the same cars
 MAX_SCENES = 1_000_000
 PIECE_SCENES = 8  # scenes of a piece; their demonstrations are held at once
 MAX_FRAMES = 36_000  # frames of one scene: an hour
 MAX_AGENTS = 5_000_000  # agent records of one scene
-LIMIT_MPS = 15.65  # m/s, 35 mph: main roads of Palo Alto
-EGO = {"length": 4.87, "width": 1.85, "centre_ahead": 0.0}  # m
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
@@ -112,7 +109,7 @@ def parts(path: Path, spec: dict) -> list[Path]:
     found = _datasets(path, spec)
     if not found:
         raise InputError(
-            f"{path}: no scenes/.zarray and no folder {one_pattern(spec, '*.zarr')}: "
+            f"{path}: no scenes/.zarray and no folder {one_pattern(spec)}: "
             "expected L5 data"
         )
     met: dict[tuple[str, ...], Path] = {}
@@ -129,7 +126,7 @@ def parts(path: Path, spec: dict) -> list[Path]:
 
 def _datasets(path: Path, spec: dict) -> list[Path]:
     """Datasets in a folder or its scenes/."""
-    pattern = one_pattern(spec, "*.zarr")
+    pattern = one_pattern(spec)
     return sorted({*path.glob(pattern), *path.glob(f"scenes/{pattern}")})
 
 
@@ -229,7 +226,7 @@ class _Dataset:
             raise InputError(f"{where}: {field}: [{start}, {stop}]: expected frames")
         frames = self.frames.read(start, stop)
         t = (frames["timestamp"] - frames["timestamp"][0]).astype(np.float64) * 1e-9
-        rate = positive(spec, "rate_hz", RATE_HZ)
+        rate = positive(spec, "rate_hz")
         step = float(np.median(np.diff(t))) if t.size > 1 else 1.0 / rate
         if not 0.5 < step * rate < 2.0:
             raise InputError(
@@ -247,15 +244,15 @@ class _Dataset:
             map_notes = [f"no map here; {note}"]
         return Recording(
             name=name,
-            source=str(spec.get("source", "L5 prediction dataset")),
-            licence=str(spec.get("licence", "unknown")),
+            source=spec["source"],
+            licence=spec["licence"],
             rate_hz=rate,
             start_s=float(frames["timestamp"][0]) * 1e-9,
             origin=(float(origin[0]), float(origin[1])),
             tracks=tuple(tracks),
             lanes=lanes,
             signals=signals,
-            default_speed_limit=positive(spec, "speed_limit", LIMIT_MPS),
+            default_speed_limit=positive(spec, "speed_limit"),
             notes=(*notes, *origin_notes(origin), *map_notes),
         )
 
@@ -271,7 +268,7 @@ class _Dataset:
                 "expected a rotation matrix"
             )
         heading, speed = np.arctan2(ahead[:, 1], ahead[:, 0]), np.full(t.size, np.nan)
-        boxes = ego_boxes(self.spec, EGO, t, x, y, heading, speed)
+        boxes = ego_boxes(self.spec, t, x, y, heading, speed)
         car = recording_car(self.spec)
         return tracks_of(path, boxes, MAX_GAP_S, automated=car)[0]
 
@@ -287,7 +284,7 @@ class _Dataset:
                 f"{path}: agent {row}: label_probabilities: not finite: "
                 "expected probabilities"
             )
-        least = number(self.spec, "min_probability", 0.5)
+        least = number(self.spec, "min_probability")
         best = labels.argmax(axis=1) if agents.size else np.zeros(0, np.int64)
         likely = labels.max(axis=1, initial=0.0) >= least
         kinds = np.where(likely, KIND_OF_LABEL[best], UNKNOWN)
@@ -299,8 +296,7 @@ class _Dataset:
         speed = np.hypot(*agents["velocity"].astype(np.float64).T)
         length, width, _ = agents["extent"].astype(np.float64).T
         boxes = Boxes(ids, names, t[frame], x, y, heading, speed, length, width, kinds)
-        unknown = str(self.spec.get("unknown", "drop"))
-        return tracks_of(path, boxes, MAX_GAP_S, unknown)
+        return tracks_of(path, boxes, MAX_GAP_S, self.spec["unknown"])
 
     def _signals(
         self, where: str, frames: np.ndarray, t: np.ndarray, lanes: tuple[Lane, ...]

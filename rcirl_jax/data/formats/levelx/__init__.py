@@ -5,7 +5,6 @@ from rcirl_jax.data.formats.format import Format, of_columns
 FORMAT = Format(
     columns=of_columns("frame id xvelocity", "frame trackid xcenter"),
     is_small=True,
-    is_declared=True,
     options={"map": "maps", "partial": True, "table": {}},
     free=("sizes", "table"),
 )

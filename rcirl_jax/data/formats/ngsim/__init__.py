@@ -6,7 +6,6 @@ FORMAT = Format(
     columns=of_columns("vehicle_id frame_id local_y v_vel lane_id"),
     told_by="reader",
     is_cut=True,
-    is_declared=True,
     options={"long_bytes": 0, "table": {}},
     free=("sizes", "table"),
 )

@@ -92,7 +92,7 @@ def parts(path: Path, spec: dict) -> list[Path]:
     """
     if path.is_file():
         return [path]
-    wanted = patterns(spec, ["*.txt", "*.csv"])
+    wanted = patterns(spec)
     found = firsts_of_a_name(
         file
         for pattern in wanted

@@ -281,7 +281,7 @@ class NuplanMap:
         sides, assumed = [], False
         for fid in bounds:  # distance [n] m of each from the centre line's points
             blobs = [self._bounds[fid]] if fid in self._bounds else []
-            (line,) = self._package.lines("boundaries", blobs) or [()]
+            (line,) = self._package.lines("boundaries", blobs) or [np.zeros((0, 2))]
             half = np.full(len(centre), HALF_WIDTH_M)
             if len(line):
                 half = distance_to_line(centre, line)
@@ -291,7 +291,8 @@ class NuplanMap:
         if stops:
             places = [self._stops[fid] for fid in stops if fid in self._stops]
             places.sort(key=lambda place: np.hypot(*(place - centre[0])))
-            line = line_across(centre, *sides, (places or [centre[0]])[0])
+            near = (places or [centre[0]])[0]
+            line = line_across(centre, sides[0], sides[1], near)
         return Lane(
             centre=centre,
             left_width=sides[0],

@@ -81,17 +81,13 @@ DRIVE = re.compile(r"(?P<drive>.+_veh-\d+)_\d+_\d+")
 MAX_FRAMES = 10_000_000  # lidar_pc rows
 MAX_TRACKS = 10_000_000
 MAX_BOXES = 20_000_000  # boxes of one window
-RATE_HZ = 20.0  # 1/s
 HOLD_S = 1.0  # s, a light without status keeps its state this long
 MAX_STAMP_GAP_S = 0.2  # s, between a lidar_pc and the pose linked to it
-LIMIT_MPS = 15.65  # m/s, 35 mph
-# Chrysler Pacifica: 4.049 m before, 1.127 m behind the rear axle
-EGO = {"length": 5.176, "width": 2.297, "rear_axle_to_centre": 1.461}  # m
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """Lists the databases: each can be read without the others."""
-    return files_below(path, one_pattern(spec, "*.db"))
+    return files_below(path, one_pattern(spec))
 
 
 def own_name(file: Path) -> str:
@@ -198,15 +194,15 @@ class _Log:
         return Recording(
             name=self.name,
             group=self.group,
-            source=str(spec.get("source", "nuPlan")),
-            licence=str(spec.get("licence", "unknown")),
-            rate_hz=positive(spec, "rate_hz", RATE_HZ),
+            source=spec["source"],
+            licence=spec["licence"],
+            rate_hz=positive(spec, "rate_hz"),
             start_s=float(self.start) * 1e-6,
             origin=(float(origin[0]), float(origin[1])),
             tracks=tuple(tracks),
             lanes=lanes,
             signals=self._signals(poses[:, 0]),
-            default_speed_limit=positive(spec, "speed_limit", LIMIT_MPS),
+            default_speed_limit=positive(spec, "speed_limit"),
             notes=(*notes, *origin_notes(origin)),
         )
 
@@ -224,7 +220,7 @@ class _Log:
             raise self.database.error(
                 "ego_pose.qw, qx, qy, qz", f"norm {bad[0]:g}", "1"
             )
-        boxes = ego_boxes(self.spec, EGO, t, x, y, heading, np.hypot(vx, vy))
+        boxes = ego_boxes(self.spec, t, x, y, heading, np.hypot(vx, vy))
         rising = t.size > 1 and bool(np.all(np.diff(stamp) > 0.0))
         if rising and np.max(np.abs(t - stamp)) <= MAX_STAMP_GAP_S:
             x, y = (v + np.gradient(v, stamp) * (t - stamp) for v in (boxes.x, boxes.y))

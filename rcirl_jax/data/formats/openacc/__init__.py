@@ -2,4 +2,4 @@
 
 from rcirl_jax.data.formats.format import Format
 
-FORMAT = Format(told_by="reader", is_small=True, is_declared=True, free=("sizes",))
+FORMAT = Format(told_by="reader", is_small=True, free=("sizes",))

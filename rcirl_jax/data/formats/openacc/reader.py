@@ -114,7 +114,7 @@ def _first_lines(path: Path) -> tuple[list[list[str]], list[str]]:
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """Returns the drives, without specifications, notes and tables beside them."""
-    files = files_below(path, one_pattern(spec, "*.csv"))
+    files = files_below(path, one_pattern(spec))
     if path.is_dir():
         files = [file for file in files if not NOT_LOGS.fullmatch(file.name)] or files
         files = [file for file in files if _is_drive(file)] or files

@@ -24,7 +24,6 @@ from rcirl_jax.errors import InputError, extra_module
 
 EXTRA = "ros2"
 METADATA = "metadata.yaml"
-PATTERNS = ("*.mcap", "*.db3")
 PACKED = (".zstd", ".lz4")  # endings of files that rosbag2 compressed as a whole
 MAGIC = b"\x89MCAP0\r\n"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -64,7 +63,7 @@ def bags_of(path: Path, spec: dict) -> list[Path]:
     """Lists the bags of an input: folders with metadata.yaml, files outside of them."""
     if path.is_file() or (path / METADATA).is_file():
         return [path]
-    wanted = patterns(spec, PATTERNS)
+    wanted = patterns(spec)
     found = [file for pattern in (*wanted, METADATA) for file in path.rglob(pattern)]
     files = {file for file in found if is_input(path, file)}
     folders = {file.parent for file in files if file.name == METADATA}

@@ -40,9 +40,6 @@ from rcirl_jax.data.readers.reading import reading
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording
 
-# m; Autoware's sample_vehicle (vehicle_info.param.yaml): overhangs 1.0 and 1.1, wheel
-# base 2.79, tread 1.64 and 0.128 on either side
-EGO = {"length": 4.89, "width": 1.896, "rear_axle_to_centre": 1.345}
 NEEDED = ("ego", "obstacles")
 
 parts = bags_of
@@ -69,8 +66,6 @@ class BagDrive(Drive):
     """
 
     widths = WIDTHS
-    usual = ("ROS 2 bag", "of the bag's owner", 13.41)  # m/s, 30 mph
-    car = EGO
 
     def __init__(self, bag: Path, spec: dict) -> None:
         self.files = files_in(bag)
@@ -79,8 +74,8 @@ class BagDrive(Drive):
         self.lights = light_places(spec)
         frames = section(spec, "frames")
         self.context = Context(
-            map_frame=str(frames.get("map", "map")),
-            base_frame=str(frames.get("base", "base_link")),
+            map_frame=frames["map"],
+            base_frame=frames["base"],
             kinds=section(spec, "kinds"),
         )
 
@@ -122,7 +117,7 @@ class BagDrive(Drive):
                     if not topic.is_silent:
                         known.setdefault(name, topic)
         roles = {}
-        for role, names in topics_of(self.spec, dict.fromkeys(TYPES, ())).items():
+        for role, names in topics_of(self.spec, TYPES).items():
             types, met = TYPES[role], [name for name in names if name in known]
             read = [n for n in met if known[n].type in types and known[n].is_described]
             if read:
@@ -191,7 +186,7 @@ class BagDrive(Drive):
 
     def selected(self, table: np.ndarray) -> tuple[np.ndarray, list[str]]:
         """Drops the ego among the obstacles, and what is driven over or under."""
-        own = self.context.names.get(str(self.spec.get("ego_id", "")), -1)
+        own = self.context.names.get(self.spec["ego_id"], -1)
         table = table[table[:, 1] != own]
         flat = table[:, 8] == LEFT_OUT
         table, notes = self._on_the_map(table[~flat])

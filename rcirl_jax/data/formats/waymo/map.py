@@ -32,7 +32,6 @@ BOUNDARY = ("lane_start_index", "lane_end_index", "boundary_feature_id")
 SIDES = ("left", "right")
 LANE_TYPES = {0: "undefined", 1: "freeway", 2: "surface_street", 3: "bike_lane"}
 DRIVEN = ("undefined", "freeway", "surface_street")
-WIDTH_M = 3.5  # m, of lanes without boundaries
 MAX_HALF_WIDTH_M = 5.0  # m; a farther line does not bound the lane
 MEASURE_STEP = 4  # points (2 m) between those at which widths are measured
 MAX_POINTS = 5_000_000  # of all lanes; 10,000 km of them are no map
@@ -41,7 +40,6 @@ OFF, RED, YELLOW, GREEN = range(len(STATES))
 COLOURS = np.array([OFF, RED, YELLOW, GREEN, RED, YELLOW, GREEN, OFF, OFF], np.int8)
 FLASHING_STOP = 7  # a stop sign, in effect
 MAX_COLOURS = 50_000_000  # lanes by steps; 1000 lanes over an hour take 36 million
-GAP_S = 2.0  # s, a signal unseen for so long kept its colour if it has it again
 
 
 def read_map(
@@ -133,7 +131,7 @@ def _lanes(
     both = [_by_id(where, features, kind) for kind in ("road_line", "road_edge")]
     lines = {key: line for kind in both for key, line in kind.items() if line.polyline}
     bounds = _polylines(where, lines, origin)
-    order, default = list(heads.values()), 0.5 * number(spec, "lane_width_m", WIDTH_M)
+    order, default = list(heads.values()), 0.5 * number(spec, "lane_width_m")
     line_of = [centres[key] for key in heads]
     widths = [_half_widths(where, side, order, line_of, bounds) for side in SIDES]
     beside = [_neighbours(order, side) for side in SIDES]
@@ -287,7 +285,7 @@ def _signals(
     # of two heads for one lane the first that is known counts: it is written last
     known = np.flatnonzero(COLOURS[state] != OFF)[::-1]
     colours[rows[known], step[known]] = COLOURS[state[known]]
-    gap = number(spec, "signal_gap_s", GAP_S)
+    gap = number(spec, "signal_gap_s")
     for row in colours:  # fill short unseen times between equal colours
         known = np.flatnonzero(row != OFF)
         before, after = known[:-1], known[1:]

@@ -77,9 +77,7 @@ RATE_TOLERANCE = 0.05  # relative; real stamps jitter by less
 MAX_SPAN_S = 3600.0  # s of one scenario
 MAX_STATES = 2_000_000  # of all tracks; a scenario has some 1e5
 MAX_GAP_STEPS = 5.5  # invalid steps bridged inside one track
-LIMIT_MPS = 15.65  # m/s, 35 mph
 SMALL_M = 0.05  # m; smaller boxes are errors, larger ones are clipped
-PATTERNS = ("*.tfrecord", "*.tfrecord-*-of-*")
 WINDOW_S = (5.0, 12.0)  # s, scenarios of this length are overlapping windows
 MIB = 1024**2
 MAX_NAME = 100  # characters kept of a scenario id
@@ -90,12 +88,12 @@ EXPECTED = (
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """Lists the TFRecord files; each can be read alone."""
-    return files_below(path, patterns(spec, PATTERNS), "TFRecord files")
+    return files_below(path, patterns(spec), "TFRecord files")
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """Yields one Recording per scenario, one record in memory at a time."""
-    limit = int(number(spec, "max_record_mib", 32) * MIB)
+    limit = int(number(spec, "max_record_mib") * MIB)
     for file in parts(path, spec):
         size, done = file.stat().st_size, 0
         for count, data in enumerate(read_records(file, limit)):
@@ -132,17 +130,15 @@ def _read_scenario(where: str, default: str, data: bytes, spec: dict) -> Recordi
         notes = [shared, *notes]
     return Recording(
         name=name,
-        source=str(spec.get("source", "Waymo Open Motion Dataset")),
-        licence=str(spec.get("licence", "unknown")),
+        source=spec["source"],
+        licence=spec["licence"],
         rate_hz=RATE_HZ,
         tracks=tracks,
         lanes=lanes,
         signals=signals,
         group=name,
         # of lanes without one: the median of the scenario's, if any
-        default_speed_limit=float(np.median(limits))
-        if limits
-        else number(spec, "speed_limit", LIMIT_MPS),
+        default_speed_limit=float(np.median(limits or [number(spec, "speed_limit")])),
         notes=(*origin_notes(origin), *notes, *map_notes),
     )
 
