@@ -39,9 +39,9 @@ METRICS = {
     "nuplan": Metric(
         title="nuPlan's score, more is better", unit="points", scale=100.0
     ),
-    "jerk": Metric(
-        title="Drives with raw |jerk| below 6 m/s³, more is better", unit="%",
-        scale=100.0,
+    "rms_a": Metric(
+        title="RMS acceleration saved against the incumbent, more is better", unit="%",
+        scale=100.0, signed=True,
     ),
     "progress": Metric(
         title="Progress against the incumbent, more is better", unit="%",
@@ -92,16 +92,9 @@ class _VerdictFile(msgspec.Struct):
     config: dict = {}
 
 
-class _Rate(msgspec.Struct):
-    rate: float
-    low: float
-    high: float
-
-
 class _Row(msgspec.Struct):
     """A row of suite.json."""
 
-    per_case: dict[str, _Rate]
     at_fault: int
     nuplan: float
     nuplan_low: float
@@ -193,12 +186,13 @@ def _flat(tree: object, name: str) -> dict[str, object]:
 
 
 def _of_verdict(verdict: _VerdictFile) -> dict[str, Interval]:
-    """Return progress against the incumbent, as the report's card has it."""
-    for kind in ("gain", "no loss"):
+    """Return numbers against the incumbent, as the report's cards have them."""
+    found = {}
+    for kind in ("no loss", "gain"):
         for one in verdict.checks:
-            if (one.kind, one.name) == (kind, "progress") and one.measured:
-                return {"progress": (one.difference, one.low, one.high)}
-    return {}
+            if one.kind == kind and one.name in ("progress", "rms_a") and one.measured:
+                found[one.name] = one.difference, one.low, one.high
+    return found
 
 
 def _of_suite(path: Path, cases: int) -> dict[str, Interval]:
@@ -206,13 +200,10 @@ def _of_suite(path: Path, cases: int) -> dict[str, Interval]:
     if (found := _candidate(path, "report")) is None:
         return {}
     row = checked(found, _Row, f"{path}: {CANDIDATE}")
-    numbers = {
+    return {
         "nuplan": (row.nuplan, row.nuplan_low, row.nuplan_high),
         "at_fault": (row.at_fault / cases, *clopper_pearson(row.at_fault, cases)),
     }
-    if jerk := row.per_case.get("j_station"):
-        numbers["jerk"] = (jerk.rate, jerk.low, jerk.high)
-    return numbers
 
 
 def _of_row(path: Path, field: str, name: str) -> dict[str, Interval]:

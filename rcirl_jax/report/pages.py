@@ -31,6 +31,9 @@ TERMS = {
     "fault or off the road, else progress, time to collision, speed and comfort",
     "progress": "way along the road in the time of a case",
     "jerk": "change of acceleration in a second; much of it feels rough",
+    "RMS acceleration": "root of the mean square over a drive: how hard and how long "
+    "one is pushed; discomfort grows with acceleration (de Winkel et al. 2023)",
+    "brake taps": "turns from driving to braking by more than 1 m/s² within 2 s",
     "nearer to the human": "less distance along the road from what the recorded human "
     "did, over held-out drives from the same start",
     "baseline": "a driver or a score that learned nothing from these recordings",

@@ -13,6 +13,8 @@ from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.store.dataset import Dataset, Demonstrations
 from rcirl_jax.evaluation.closed_loop.dial import MEASURES
 from rcirl_jax.evaluation.closed_loop.summary import (
+    COMFORT_HEADS,
+    COMFORT_TITLE,
     PAPER,
     SHORT,
     Rate,
@@ -20,6 +22,7 @@ from rcirl_jax.evaluation.closed_loop.summary import (
     SuiteComparison,
     SuiteReport,
     SuiteRuns,
+    comfort_cells,
     summarise,
 )
 from rcirl_jax.evaluation.gate.types import Check, GateConfig, Verdict
@@ -233,8 +236,8 @@ def cards(
         _amount(
             verdict,
             "Comfort",
-            ("a_station", "j_station"),
-            "points of all drives: within 4 m/s² / 6 m/s³",
+            ("rms_a", "rms_j"),
+            f"less RMS acceleration / RMS jerk than {incumbent}",
         ),
         _amount(verdict, "Progress", ("progress",), f"of {incumbent}'s"),
     ]
@@ -264,10 +267,9 @@ def _amount(
     kind = "refused" if any(c.outcome == "fail" for c in every) else "open"
     if kind == "open" and all(c.low > 0.0 for c in found):
         kind = "ship"
-    unit = "" if words.startswith("points") else " %"
     return {
         "title": title,
-        "value": values + unit,
+        "value": f"{values} %",
         "words": f"{words} {ends}",
         "kind": kind,
     }
@@ -416,6 +418,9 @@ def suite_view(suite: SuiteReport, marked: Sequence[str]) -> dict:
         ]
         found = Table(caption=title, heads=heads, rows=[*rows, *paper], marked=marked)
         tables.append(found)
+    rows = [(name, *comfort_cells(row)) for name, row in suite.rows.items()]
+    heads = ("", *COMFORT_HEADS)
+    tables.append(Table(caption=COMFORT_TITLE, heads=heads, rows=rows, marked=marked))
     tables.append(_safety(suite.rows, suite.reference, marked))
     if suite.comparisons:
         tables.append(_comparisons(suite.comparisons))

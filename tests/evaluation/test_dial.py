@@ -19,6 +19,7 @@ def drives(progress, faults=(0, 0, 0, 0)):
     values |= {
         "progress": np.array(progress), "at_fault": faults, "no_fault": 1.0 - faults,
         "holds": np.tile(faults[:, None] == 0, 6), "rms_j": np.full(4, 0.5),
+        "rms_a": np.full(4, 0.25),
     }  # fmt: skip
     return CaseMetrics(**values)
 
@@ -36,9 +37,10 @@ def test_settings_are_measured_and_set_against_the_own_cost():
     assert turned["progress"]["value"] == pytest.approx(200.0)
     assert turned["progress"]["minus_own"]["mean"] == pytest.approx(100.0)
     # Clopper and Pearson's interval of 3 in 4
-    for name in ("no_fault", "jerk"):
-        ends = [turned[name][key] for key in ("value", "low", "high")]
-        assert ends == pytest.approx([75.0, 19.412, 99.369], abs=1e-3)
-        assert turned[name]["minus_own"]["mean"] == pytest.approx(-25.0)
+    ends = [turned["no_fault"][key] for key in ("value", "low", "high")]
+    assert ends == pytest.approx([75.0, 19.412, 99.369], abs=1e-3)
+    assert turned["no_fault"]["minus_own"]["mean"] == pytest.approx(-25.0)
+    rms = [own[name]["value"] for name in ("rms_acceleration", "rms_jerk")]
+    assert rms == pytest.approx([0.25, 0.5])
     assert turned["distance"]["value"] == pytest.approx(3.0)
     assert turned["distance"]["minus_own"]["mean"] == pytest.approx(-1.0)

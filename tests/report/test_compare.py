@@ -15,8 +15,6 @@ from tests.helpers.commands import refused, succeeded
 from tests.report.test_data_page import Page
 from tests.report.tuning_case import suite_and_verdict
 
-RATE = {"k": 80, "n": 120, "rate": 0.667, "low": 0.574, "high": 0.75, "bound": None}
-
 
 def write_run(
     folder, *, recipe="tuned", rate=0.01, data="ab" * 32, nuplan=0.9, drives=True
@@ -26,7 +24,7 @@ def write_run(
     (folder / "suite").mkdir(parents=True)
     write_verdict(folder / "verdict.json", verdict, GateConfig(), {})
     row = {
-        "per_case": {"j_station": RATE}, "at_fault": 12, "nuplan": nuplan,
+        "at_fault": 12, "nuplan": nuplan,
         "nuplan_low": nuplan - 0.02, "nuplan_high": nuplan + 0.01,
     }  # fmt: skip
     config = {"learning_rate": rate, "reward": {"hidden": [32, 16]}}
@@ -89,14 +87,14 @@ def test_numbers_of_the_runs_with_their_intervals(compared):
         [row[-1] for row in rows(page) if row[0].endswith(name) and len(row) == 3]
         for name in ("/first", "/second")
     )
-    (way,) = [c for c in verdict.checks if (c.kind, c.name) == ("gain", "progress")]
+    gains = {c.name: c.difference for c in verdict.checks if c.kind == "gain"}
     low, high = (100.0 * x for x in clopper_pearson(12, 120))
     assert first[0] == "90.0 [88.0, 91.0] points"
     assert second[0] == "80.0 [78.0, 81.0] points"
-    assert first[1] == "66.7 [57.4, 75.0] %"
-    assert float(re.match(r"[+−][\d.]+", first[2])[0].replace("−", "-")) == (
-        pytest.approx(100.0 * way.difference, abs=0.051)
-    )
+    for cell, name in zip(first[1:3], ("rms_a", "progress"), strict=True):
+        assert float(re.match(r"[+−][\d.]+", cell)[0].replace("−", "-")) == (
+            pytest.approx(100.0 * gains[name], abs=0.051)
+        )
     assert first[3] == f"10.00 [{low:.2f}, {high:.2f}] %"
     assert first[4:] == ["1.60 [1.20, 2.00] m", "2.50 [2.30, 2.70] m"]
     assert second[4] == "not measured"

@@ -158,7 +158,7 @@ def test_the_cards_say_what_the_checks_say(page, report):
     assert 'class="card refused"><h3>Safety' in text
     gains = {c.name: c for c in report.verdict.checks if c.kind == "gain"}
     comfort = [number(x) for x in found["Comfort"].split(" / ")]
-    wanted = [100.0 * gains[name].difference for name in ("a_station", "j_station")]
+    wanted = [100.0 * gains[name].difference for name in ("rms_a", "rms_j")]
     assert comfort == pytest.approx(wanted, abs=0.051)
     progress = 100.0 * gains["progress"].difference
     assert number(found["Progress"]) == pytest.approx(progress, abs=0.051)

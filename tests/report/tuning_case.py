@@ -46,6 +46,7 @@ def metrics(seed, spoiled=None):
         "holds": holds, "holds_filtered": holds[:, 4:],
         "at_fault": faults, "collisions": faults, "no_fault": 1.0 - faults,
         "progress": 1000.0 * rng.uniform(0.8, 1.2, size=count),
+        "rms_a": rng.uniform(0.7, 0.9, count), "rms_j": rng.uniform(0.5, 0.8, count),
         "min_ttc": rng.uniform(1.0, 9.0, size=count),
     }  # fmt: skip
     good = ("drivable", "direction", "ttc_bound", "speed_compliance", "comfort")

@@ -20,7 +20,7 @@ from rcirl_jax.evaluation.statistics import (
     family_clusters,
     over_clusters,
 )
-from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
+from rcirl_jax.simulation.metrics import CaseMetrics, nuplan_score
 
 SETTINGS, CASES = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0), 10  # and cases of each family
 FEW_SETTINGS, FEW_CASES = (0.0, 0.5, 1.0, 2.0), 2  # of a run that drives little
@@ -43,7 +43,7 @@ MEASURES = {
         ("nuplan", "nuPlan", "points", 1, "higher", False),
         ("progress", "progress", "% of the own cost's", 1, "higher", False),
         ("no_fault", "no at-fault collision", "% of cases", 1, "higher", True),
-        ("jerk", "|jerk| < 6 m/s³ throughout", "% of cases", 1, "higher", True),
+        ("rms_acceleration", "RMS acceleration", "m/s²", 2, "lower", False),
         ("rms_jerk", "RMS jerk", "m/s³", 2, "lower", False),
         ("distance", "distance to the human", "m", 2, "lower", False),
     )
@@ -81,7 +81,7 @@ def compare_settings(
             "nuplan": 100.0 * np.asarray(nuplan_score(m, jnp.asarray(way))[0]),
             "progress": 100.0 * np.asarray(m.progress) / max(own, 1e-9),
             "no_fault": 100.0 * (np.asarray(m.at_fault) == 0),
-            "jerk": 100.0 * np.asarray(m.holds)[:, COLUMNS.index("j_station")],
+            "rms_acceleration": np.asarray(m.rms_a),
             "rms_jerk": np.asarray(m.rms_j),
             "distance": distance[dial],
         }

@@ -28,6 +28,7 @@ EXIT_CODES: dict[Decision, int] = {
 CANDIDATE, INCUMBENT = "candidate", "incumbent"  # names of rows
 MAX_ACCEPTED = 3  # cases; more than a person looks at are no exceptions
 IMPACT_MPS = 10.0  # m/s at which an at-fault impact counts as one
+FELT = ("rms_a", "rms_j")  # fields of CaseMetrics: comfort, of which less is better
 DRIVES = 240  # held-out drives of a full run, or all there are
 
 
@@ -59,10 +60,10 @@ class GateConfig:
     # share of the incumbent's distance to the human. 240 drives of 163 vehicles told
     # rewards apart by 11 to 13 % of it
     likeness: float = 0.10
-    # loss in one primary metric that a gain in another may cost; share of cases, or
-    # of the score
+    # loss in one primary metric that a gain in another may cost; share of cases, of
+    # the score, or of the incumbent's RMS
     gain: float = 0.02
-    primary: tuple[str, ...] = ("a_station", "j_station", "progress", "nuplan")
+    primary: tuple[str, ...] = ("rms_a", "rms_j", "a_station", "progress", "nuplan")
     # rows that the candidate has to be ahead of
     trivial_baselines: tuple[str, ...] = TRIVIAL_BASELINES
     # cases with a new fault that a person has looked at and accepts, `MAX_ACCEPTED`
@@ -78,7 +79,7 @@ class GateConfig:
         for name, margin in self.margins.items():
             if not 0.0 < margin < 1.0:
                 raise InputError(f"{name}: {margin}: expected within (0, 1)")
-        known = (*COLUMNS, "progress", "nuplan")
+        known = (*COLUMNS, *FELT, "progress", "nuplan")
         if not self.primary or not set(self.primary) <= set(known):
             bad = next((n for n in self.primary if n not in known), "none")
             raise InputError(f"primary: {bad}: expected some of {', '.join(known)}")

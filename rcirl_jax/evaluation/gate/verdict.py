@@ -45,6 +45,7 @@ from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, SuiteResult
 from rcirl_jax.evaluation.closed_loop.summary import result_hash
 from rcirl_jax.evaluation.gate.types import (
     CANDIDATE,
+    FELT,
     IMPACT_MPS,
     Check,
     Decision,
@@ -568,6 +569,9 @@ def _gains(pair: Pair, config: GateConfig) -> Iterator[Check]:
             pairs = _discordant(mine[name], theirs[name])
         elif name == "progress":
             both = _progress(pair)
+        elif name in FELT:
+            each = [np.asarray(getattr(m, name), np.float64) for m in drives]
+            both = tuple(-x / max(float(each[1].mean()), 1e-9) for x in each)
         else:  # nuPlan's score
             way = jnp.asarray(pair.runs.way)
             a, b = (np.asarray(nuplan_score(m, way)[0], np.float64) for m in drives)
@@ -578,7 +582,8 @@ def _gains(pair: Pair, config: GateConfig) -> Iterator[Check]:
             found = over_clusters(*both, bootstrap)
             # both tests have to see it: cases, and families as clusters
             p = found.p if pairs is None else max(mcnemar_exact(*pairs), found.p)
-        found = _clipped(found, high=np.inf if name == "progress" else 1.0)
+        if name not in FELT:  # which may be any number of times the incumbent's
+            found = _clipped(found, high=np.inf if name == "progress" else 1.0)
         rows.append((name, found, pairs, p))
     nearer = _nearer(pair, pair.name)
     if not isinstance(nearer, str):

@@ -67,6 +67,12 @@ WORDS = {
         "hits harder at fault, by {harder} m/s in 1,000 cases",
     ),
     "progress": Words("progress", "makes {less} % less progress", "progress {more} %"),
+    "rms_a": Words(
+        "RMS acceleration",
+        "accelerates and brakes {size} % harder (RMS)",
+        "RMS acceleration {size} % lower",
+    ),
+    "rms_j": Words("RMS jerk", "has {size} % more RMS jerk", "RMS jerk {size} % lower"),
     "nuplan": Words(
         "nuPlan's score",
         "has {less} points less of nuPlan's score",
@@ -96,7 +102,7 @@ HEADS = {
 # what a reader asks after first: metrics of which a gain in one answers it
 MAIN = {
     "nearness to people": {"likeness"},
-    "comfort": {"a_station", "j_station"},
+    "comfort": {"rms_a", "rms_j", "a_station", "j_station"},
     "progress": {"progress"},
     "nuPlan's score": {"nuplan"},
 }
@@ -198,6 +204,7 @@ def _numbers(check: Check) -> dict[str, object]:
         "fault": words.one if check.lost == 1 else words.title,
         "less": f"{-percent:.1f}",
         "more": f"{percent:+.1f}",
+        "size": f"{abs(percent):.1f}",
         "harder": f"{-1000.0 * IMPACT_MPS * check.difference:.0f}",
     }
 
