@@ -222,15 +222,6 @@ def test_lane_numbers_of_the_log_name_the_lanes():
     assert {lane.id.partition(".")[0] for lane in roads.lanes} == {"5", "7", "9"}
 
 
-def test_few_positions_make_few_lanes_or_none():
-    assert roads_from_tracks([]).lanes == ()
-    still = highway(minutes=0.2).tracks[0]
-    stands = dataclasses.replace(still, x=0.0 * still.x, y=0.0 * still.y)
-    assert roads_from_tracks([stands]).lanes == ()
-    one = roads_from_tracks([still])
-    assert len({lane.id.partition(".")[0] for lane in one.lanes}) == 1
-
-
 def test_a_lap_closes():
     """Three laps of 1,885 m: lanes that lead back to their start."""
     radius, t = 300.0, np.arange(0.0, 3.2 * 2 * np.pi * 15.0, 0.1)

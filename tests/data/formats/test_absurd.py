@@ -1,17 +1,9 @@
 """Numbers in range for a parser and absurd for a road; faults no check foresaw."""
 
-import dataclasses
-import os
-import subprocess
-import sys
-
 import pytest
 
 from rcirl_jax.data import formats
-from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.readers.tables import streams
-from rcirl_jax.data.recording import validate_recording
-from rcirl_jax.errors import InputError
 from tests.data.formats.fixtures import csv, format_of, modules
 from tests.helpers.logs import read, refused
 
@@ -78,39 +70,3 @@ def test_a_fault_of_ours_is_not_the_users(tmp_path, monkeypatch):
         read("csv", fixture.input)
     (note,) = caught.value.__notes__
     assert note.startswith(f"while reading {fixture.input}")
-
-
-@pytest.mark.multiprocess
-@pytest.mark.parametrize(
-    ("work", "said"),
-    [
-        ("import numpy; numpy.empty(2**62, numpy.uint8)", "Unable to allocate 4.00 Ei"),
-        ("import jax; jax.numpy.zeros(2**45)", "RESOURCE_EXHAUSTED: Out of memory"),
-    ],
-)
-def test_memory_that_is_not_given_is_one_line(work, said):
-    script = f"from rcirl_jax.cli.running import run; run(lambda: exec({work!r}))"
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=False
-    )
-    assert (done.returncode, done.stdout) == (2, "")
-    (line,) = done.stderr.splitlines()
-    assert line.startswith(f"error: memory: {said}")
-    assert line.endswith(": expected more for this work")
-
-
-def test_names_that_are_no_text(tmp_path):
-    """A file's name may be any bytes; what an import writes has to be text."""
-    odd = tmp_path / os.fsdecode(b"a\xff.csv")
-    odd.write_text("t,id,x,y\n")
-    with pytest.raises(InputError, match=r"name: 'a\\udcff\.csv': expected UTF-8"):
-        next(read_recordings("csv", odd))
-    (recording,) = read("csv", csv.write(made(tmp_path / "log")).input)
-    track = dataclasses.replace(recording.tracks[0], id="\ud800")
-    for field, value in (
-        *(("name", "\udcff"), ("group", "\udcff"), ("licence", "\udcff")),
-        *(("notes", ("\udcff",)), ("tracks", (track, *recording.tracks[1:]))),
-    ):
-        bad = dataclasses.replace(recording, **{field: value})
-        with pytest.raises(InputError, match=r"expected UTF-8 text"):
-            validate_recording(bad, "a.csv")

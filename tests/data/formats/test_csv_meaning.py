@@ -4,13 +4,11 @@ import math
 
 import numpy as np
 import pyarrow.parquet as pq
-import pyproj
 import pytest
 
-from rcirl_jax.data.formats.projection import projected
 from tests.data.formats import people
 from tests.data.formats.people import LONG, Way, of, refused, write
-from tests.data.formats.test_csv_ways import MIDDLE, degrees, stored
+from tests.data.formats.test_csv_ways import degrees, stored
 
 # ------------------------------------------------------------------------ places
 
@@ -24,31 +22,6 @@ def test_a_receiver_without_a_fix(tmp_path):
     found = people.only(write(tmp_path, table), source)
     assert people.rows_of(found) == (720, 3, 0, 0)
     assert sum(track.t.size for track in found.tracks) == 717
-
-
-def test_lanes_in_degrees(tmp_path):
-    place = pyproj.Proj(proj="aeqd", ellps="WGS84", lat_0=MIDDLE[0], lon_0=MIDDLE[1])
-    points = [list(place(x, 0.0, inverse=True)) for x in (-200.0, 300.0)]
-    rest = f'[[lanes]]\nid = "1"\npoints = {points}'
-    source = people.spec(tmp_path, units='x = "deg"\ny = "deg"', rest=rest)
-    (lane,) = people.only(write(tmp_path, degrees(people.rows())), source).lanes
-    assert np.hypot(*(lane.centre[1] - lane.centre[0])) == pytest.approx(
-        500.0, abs=0.05
-    )
-
-
-def test_the_projection_is_true_to_length_and_north():
-    """Against geodesics on the ellipsoid: a kilometre in each direction."""
-    geod = pyproj.Geod(ellps="WGS84")
-    for lat, lon in ((37.97, 23.73), (-33.9, 151.2), (64.1, -21.9), (0.0, 0.0)):
-        x0, y0 = projected(np.array([lon]), np.array([lat]), (lat, lon))
-        np.testing.assert_allclose([x0, y0], 0.0, atol=1e-6)
-        for azimuth in (0.0, 60.0, 150.0, 270.0):
-            far_lon, far_lat, _ = geod.fwd(lon, lat, azimuth, 1000.0)
-            x, y = projected(np.array([far_lon]), np.array([far_lat]), (lat, lon))
-            assert np.hypot(x, y)[0] == pytest.approx(1000.0, abs=0.01)
-            compass = np.rad2deg(np.arctan2(x, y))[0] % 360.0
-            assert compass == pytest.approx(azimuth, abs=0.01)
 
 
 # ------------------------------------------------------------------------- flags

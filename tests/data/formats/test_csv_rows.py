@@ -284,17 +284,3 @@ def test_a_unit_that_leaves_a_hole_in_each_minute(tmp_path, unit, start, long_by
         f"{log}: units.t: {unit}: no row has seconds 60 to 99, and those after 59 are "
         f'of the next minute: expected units.t = "{right}" (times as digits)'
     )
-
-
-@pytest.mark.parametrize("first", [0, 80_454_000, 1_717_142_694_000, 1_711_111_111_111])
-def test_long_numbers_are_no_times_of_day(tmp_path, first):
-    """Milliseconds since a start, of the day, since 1970: all with holes by a pause."""
-    table = [
-        [first + round(1000 * row[T]) + 31_700 * (row[T] > 5.9), *row[1:]]
-        for row in people.rows()
-    ]
-    path = people.write(tmp_path, table)
-    found = people.only(path, people.spec(tmp_path, units='t = "ms"'))
-    assert found.start_s == pytest.approx(first / 1000)
-    times = np.unique(np.concatenate([track.t for track in found.tracks]))
-    assert (times.size, times[-1]) == (120, pytest.approx(11.9 + 31.7))

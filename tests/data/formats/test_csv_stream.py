@@ -1,6 +1,5 @@
 """Long CSV files in pieces: the scenes of a file read at once, in bounded memory."""
 
-import dataclasses
 import fcntl
 
 import numpy as np
@@ -11,7 +10,6 @@ from rcirl_jax.data.importing import import_logs, scenes_of
 from rcirl_jax.data.inputs import InputFile
 from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.errors import InputError
 from tests.data.small_logs import CONFIG
 from tests.helpers.commands import count_and_peak
 
@@ -153,14 +151,6 @@ def test_recordings_of_one_file_stay_apart(tmp_path):
         )
 
 
-def test_a_wrong_unit_of_time_is_found(tmp_path, monkeypatch):
-    path = tmp_path / "log.csv"
-    monkeypatch.setattr(long_logs, "MAX_BLOCKS", 3)
-    spec = {**write(path, rows_of()), "long_bytes": 1}
-    with pytest.raises(InputError, match=r"t: more than 3 minutes: expected seconds"):
-        cuts(path, spec)
-
-
 MEMORY = """
 import resource, sys
 from pathlib import Path
@@ -230,14 +220,3 @@ def test_a_recording_is_on_one_side_where_there_are_several(tmp_path):
     assert len(train) == 2
     assert len(test) == 1
     assert not train & test
-
-
-def test_settings_change_the_digest_of_a_piece(tmp_path):
-    path = tmp_path / "log.csv"
-    spec = {**write(path, rows_of(seconds=70.0, cars=4)), "long_bytes": 1}
-    (first, *_) = read_part("csv", path, spec)
-    other = dataclasses.replace(first, scenes_within=(0.0, 30.0))
-    assert (
-        scenes_of(first, CONFIG.collect).sha256
-        != scenes_of(other, CONFIG.collect).sha256
-    )

@@ -12,7 +12,6 @@ from rcirl_jax.data.formats.csv.suggest import suggested
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml
 from tests.data.formats import people
-from tests.data.formats.test_csv_meaning import wide_frames
 from tests.data.formats.test_csv_rows import digits
 from tests.data.formats.test_csv_ways import degrees
 from tests.helpers.commands import command
@@ -81,22 +80,6 @@ def test_the_rate_of_frames_by_the_speeds(tmp_path, rate, unit, factor):
         np.testing.assert_allclose(np.diff(track.t), 1.0 / rate, atol=1e-6)
 
 
-def test_units_in_a_line_below_the_header(tmp_path):
-    table = people.rows()
-    for name in ("x", "y", "length"):
-        table = people.column(table, name, lambda metres: metres / 0.3048)
-    table = [[*row[:5], *row[6:]] for row in table]  # no speed that tells
-    header = [name for name in people.HEADER if name != "speed"]
-    head, *rows = people.text(table, header).splitlines()
-    path = tmp_path / "log.csv"
-    path.write_text("\n".join([head, "s,,ft,ft,rad,[ft],", *rows, ""]))
-    _, toml, (made,) = taken(path)
-    assert [toml["units"][name] for name in ("x", "y", "length")] == ["ft"] * 3
-    assert made.rows.unreadable == 0
-    ways = [abs(track.x[-1] - track.x[0]) for track in made.tracks]
-    np.testing.assert_allclose(ways, people.rows()[-6][2], atol=0.01)
-
-
 UNITS = [
     *[("speed", "m/s", 1.0), ("speed", "km/h", 3.6)],  # by the positions
     *[("speed", "mph", 2.23694), ("speed", "ft/s", 3.28084)],
@@ -128,18 +111,6 @@ def test_iso_times_and_degrees_in_parquet(tmp_path):
     assert toml["columns"]["lat"] == "latitude"
     assert toml["units"]["t"] == "iso"
     assert "recognised: t: column datetime, iso" in found.lines
-
-
-def test_a_row_per_frame(tmp_path):
-    header, table = wide_frames("{axis}_{car}")
-    path = tmp_path / "log.csv"
-    path.write_text(people.text(table, header))
-    found, toml, (made,) = taken(path)
-    assert toml["columns"] == {
-        "t": "time", "x": "x_{id}", "y": "y_{id}", "speed": "v_{id}"
-    }  # fmt: skip
-    assert len(made.tracks) == 7
-    assert any("a row per frame" in line for line in found.lines)
 
 
 # header of a known tool, with the field that each column is

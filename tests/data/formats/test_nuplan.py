@@ -15,7 +15,6 @@ from tests.helpers import logs
 from tests.helpers.logs import lanes_of, refused, tracks_of
 
 DRIVE = "2021.06.14.21.57.33_veh-38"
-read = functools.partial(logs.read, "nuplan")
 only = functools.partial(logs.only, "nuplan")
 
 
@@ -67,26 +66,6 @@ def test_ego_is_the_box_at_the_clouds_time(whole, log):
     assert (other.length, other.width) == (4.0, 1.7)
     edit(log, f"UPDATE ego_pose SET qw = {np.cos(0.35)}, qz = {np.sin(0.35)}")
     np.testing.assert_allclose(only(log).tracks[0].heading, 0.7)
-
-
-def test_rows_in_any_order_and_without_indices(whole, log):
-    """A database has no order of rows: here that of the tokens, as of a key."""
-    for table in ("lidar_box", "lidar_pc", "ego_pose", "traffic_light_status"):
-        edit(
-            log,
-            f"CREATE TABLE kept AS SELECT * FROM {table}; DELETE FROM {table};"
-            f"INSERT INTO {table} SELECT * FROM kept ORDER BY substr(hex(token), 5);"
-            "DROP TABLE kept;",
-        )
-    edit(
-        log, "DROP INDEX ix_lidar_pc_timestamp; DROP INDEX ix_lidar_box_lidar_pc_token"
-    )
-    found = only(log)
-    assert [track.id for track in found.tracks] == [t.id for t in whole.tracks]
-    for one, other in zip(found.tracks, whole.tracks, strict=True):
-        np.testing.assert_array_equal(one.t, other.t)
-        np.testing.assert_array_equal(one.x, other.x)
-    assert [s.state for s in found.signals] == [s.state for s in whole.signals]
 
 
 @pytest.mark.parametrize(

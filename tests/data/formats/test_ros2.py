@@ -76,26 +76,6 @@ def test_a_bag_of_two_files(tmp_path):
     assert has_note(made, "no map given")
 
 
-@pytest.mark.parametrize("frame", ["base_link", "map"])
-def test_the_frame_of_a_twist_does_not_matter(tmp_path, frame):
-    """Of a car that drives north: (8, 0) in its own frame is (0, 8) on the map."""
-
-    def north(message):
-        place = message["pose"]["pose"]
-        ahead = place["position"]["x"] - fixture.CENTRE[0]
-        place["position"] = fixture.point(*np.add(fixture.CENTRE, (0.0, ahead)))
-        place["orientation"] = fixture.turned(0.5 * math.pi)
-        message["child_frame_id"] = frame
-        speeds = (8.0, 0.0) if frame == "base_link" else (0.0, 8.0)
-        message["twist"]["twist"] = fixture.velocity(*speeds)
-
-    (track,) = only(tmp_path, ego(change=north), **ALONE).tracks
-    np.testing.assert_allclose(track.heading, 0.5 * math.pi, atol=1e-6)
-    np.testing.assert_allclose(track.speed, 8.0, atol=1e-6)
-    np.testing.assert_allclose(track.x, 0.0, atol=1e-6)
-    np.testing.assert_allclose(track.y, 8.0 * track.t, atol=1e-6)
-
-
 def test_headings_of_a_car_on_a_slope_by_quaternions_of_any_length(tmp_path):
     """Yaw, then pitch, then roll, by matrices: where the x axis points."""
     yaw, pitch, roll = 2.5, 0.3, -0.4
@@ -483,30 +463,6 @@ def test_other_encodings_and_definitions(tmp_path, capsys):
         assert words in line
     assert line.endswith("expected a nav_msgs/msg/Odometry with it")
     assert capsys.readouterr() == ("", "")
-
-
-def test_values_of_messages(tmp_path):
-    """The line names file, topic, message and field."""
-
-    def line(**fields):
-        def change(message):
-            message["pose"]["pose"] |= fields
-            message["header"]["frame_id"] = "map" if fields else "odom"
-
-        found = line_of(tmp_path, ego(change=change), **ALONE)
-        return found.removeprefix(f"{tmp_path / 'a.mcap'}: {ODOMETRY}: message 0: ")
-
-    nowhere, zero = fixture.point(math.nan, 0.0), dict.fromkeys("xyzw", 0.0)
-    assert line(position=nowhere) == "position.x: nan: expected a finite number"
-    assert line(orientation=zero) == (
-        "orientation: all zero: expected the ego's quaternion"
-    )
-    assert line() == (
-        "header.frame_id: 'odom': expected map or base_link ([frames] of the source "
-        "TOML)"
-    )
-    frames = {"map": "odom", "base": "base_link"}
-    assert only(tmp_path / "a.mcap", **ALONE, frames=frames).tracks
 
 
 def test_lights_of_the_older_package(tmp_path):

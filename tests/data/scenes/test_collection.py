@@ -11,7 +11,6 @@ from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.scenes.collect import Collector, assemble
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.scenes.filters import REASONS
-from rcirl_jax.data.scenes.labels import labels_of
 from rcirl_jax.data.scenes.lanes import LaneGraph
 from rcirl_jax.data.scenes.lines import CREEP_M
 from rcirl_jax.data.scenes.motion import driver_of, given_path
@@ -194,16 +193,6 @@ def test_lane_change():
     assert row["tags"][Tag.LANE_CHANGE]
     assert row["human.l"][-1] - row["human.l"][0] == pytest.approx(WIDTH, abs=0.3)
     assert row["path.l"][60] == pytest.approx(WIDTH, abs=0.1)
-
-
-def test_labels_of_scenes_side_by_side_are_those_of_each_alone():
-    slow = car("slow", lambda t: 90.0 + 2.0 * t, y=WIDTH)
-    rows = list(Collector(recording(*PAIR.tracks, slow), NO_FILTER).scenes())
-    assert len({row["decisions"].tobytes() for row in rows}) > 1
-    for row in rows:
-        decisions, tags = labels_of(row)  # no leading axis
-        np.testing.assert_array_equal(decisions, row["decisions"])
-        np.testing.assert_array_equal(tags, row["tags"])
 
 
 def braking_to(line, start=20.0, v=12.0, after=0.2):

@@ -98,21 +98,6 @@ def test_others_are_not_joined(second):
     assert joined(leader, 5.0) == leader
 
 
-def test_two_people_who_wait_side_by_side_are_two():
-    one, two = (
-        dataclasses.replace(
-            between(standing(name, x=x, kind=Kind.PEDESTRIAN), begin, 12.0),
-            length=0.6,
-            width=0.6,
-        )
-        for name, x, begin in (("1", 80.0, 0.0), ("2", 80.7, 3.0))
-    )
-    assert len(joined([one, two], 5.0)) == 2
-    assert len(joined([one, dataclasses.replace(two, x=two.x - 0.6)], 5.0)) == 1
-    rider = dataclasses.replace(two, x=two.x - 0.6, kind=Kind.CYCLIST)
-    assert len(joined([one, rider], 5.0)) == 2
-
-
 def test_they_are_counted_and_shown():
     parts = [between(standing(), 0.0, 2.0, "7"), between(standing(), 3.0, 12.0, "8")]
     flash = between(car("flash", speeding_up(60.0)), 3.0, 3.3)

@@ -1,15 +1,9 @@
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rcirl_jax.data.store import dataset as joined
 from rcirl_jax.errors import InputError
-from rcirl_jax.sampling import SamplerConfig
-from rcirl_jax.train.featurise import featurised, host_batch
-from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.train.step import gradient_sums, init_state
-from rcirl_jax.types import Normaliser
 from tests.helpers.scenes import batch, demonstration
 
 
@@ -67,30 +61,3 @@ def test_shares_from_a_flag():
     for bad in ("1,2", "1,2,0", "1,2,x", "1,2,nan", "1,2,inf", "half"):
         with pytest.raises(InputError, match="data_weights"):
             joined.shares_of(bad, 3)
-
-
-def test_a_scene_of_weight_two_counts_as_often_as_two():
-    """The step's sums are those of the weights: checked against single scenes."""
-    config = TrainConfig(sampler=SamplerConfig(num_random=4, edge_times=(4.0,)))
-    rows = Part([0, 1], []).rows
-    index = np.arange(2, dtype=np.int32)
-    norm = Normaliser(
-        lower=jnp.full(21, -1e3),
-        upper=jnp.full(21, 1e3),
-        location=jnp.zeros(21),
-        scale=jnp.full(21, 10.0),
-    )
-    state = init_state(config, norm)
-
-    def sums(weight):
-        made = featurised(
-            jax.random.key(0),
-            host_batch(rows, np.asarray(weight, np.float32), index),
-            config,
-        )
-        return gradient_sums(state.apply_fn, state.params, norm, made, config)[1]
-
-    first, second, both = sums([1, 0]), sums([0, 1]), sums([2, 0.5])
-    for name in ("loss", "terms", "pairs"):
-        one, two, found = (float(getattr(x, name)) for x in (first, second, both))
-        assert found == pytest.approx(2 * one + 0.5 * two, rel=1e-4), name
