@@ -17,7 +17,7 @@ import importlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, TypedDict
+from typing import Annotated, Any, TypedDict, TypeVar
 
 import jax
 import msgspec
@@ -37,7 +37,7 @@ from rcirl_jax.data.store.files import (
     unseal,
 )
 from rcirl_jax.data.store.rows import leaf_specs, row_spec
-from rcirl_jax.errors import InputError, counted, extra_module
+from rcirl_jax.errors import InputError, as_input_error, counted, extra_module
 from rcirl_jax.runtime.atomic_files import parse_json, plain
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.types import Demonstration
@@ -48,6 +48,8 @@ MAX_ROWS = 2**31  # rows of a dataset
 OPEN_SHARDS = 256  # shards whose arrays are kept open, 60 kB each
 EQUAL, SCENES = "equal", "scenes"  # shares of joined datasets
 Rows = Annotated[int, msgspec.Meta(ge=0, le=MAX_ROWS)]
+
+_Body = TypeVar("_Body")
 
 
 class ShardInfo(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -287,19 +289,8 @@ class Dataset(Demonstrations):
         self._files.write_many({FACTS: text.encode()})
 
     def facts(self) -> dict[str, Any]:
-        """Returns what `write_facts` wrote, or nothing.
-
-        Raises:
-          InputError: not a JSON object.
-        """
-        raw, name = self._files.read_json(FACTS), self._files.path(FACTS)
-        try:
-            found = parse_json(raw or b"{}")
-        except ValueError as error:
-            raise InputError(f"{name}: {error}: expected JSON") from error
-        if not isinstance(found, dict):
-            raise InputError(f"{name}: expected an object")
-        return found
+        """Returns what `write_facts` wrote, or nothing; InputError: no JSON object."""
+        return self._body(FACTS, dict[str, Any], b"{}")
 
     def write_plans(self, plans: Sequence[Mapping[str, object]]) -> None:
         """Writes the plans of sites (`data.plans.plan_of`) beside the manifest.
@@ -311,19 +302,14 @@ class Dataset(Demonstrations):
         self._files.write_many({PLANS: text.encode()})
 
     def plans(self) -> list[dict[str, Any]]:
-        """Returns what `write_plans` wrote, or nothing.
+        """Returns what `write_plans` wrote, or nothing; InputError: no such list."""
+        return self._body(PLANS, list[dict[str, Any]], b"[]")
 
-        Raises:
-          InputError: not a JSON list of objects.
-        """
-        raw, name = self._files.read_json(PLANS), self._files.path(PLANS)
-        try:
-            found = parse_json(raw or b"[]")
-        except ValueError as error:
-            raise InputError(f"{name}: {error}: expected JSON") from error
-        if not isinstance(found, list) or not all(isinstance(x, dict) for x in found):
-            raise InputError(f"{name}: expected a list of objects")
-        return found
+    def _body(self, key: str, kind: type[_Body], nothing: bytes) -> _Body:
+        """Reads a file beside the manifest as a type, `nothing` where there is none."""
+        raw, name = self._files.read_json(key), self._files.path(key)
+        with as_input_error(name, "JSON"):
+            return checked(parse_json(raw or nothing), kind, name)
 
     def plot(self, site: int = 0) -> str:
         """Draws the plan of a site: lanes, and where and how fast people drove.

@@ -49,15 +49,17 @@ REFUSED = {
         content=stored(pq.write_table, x=[[1.0]] * 720)
     ),
     # the layout
-    "table.separator: unknown: expected some of": moved(
+    "table: separator: unknown: expected delimiter": moved(
         rest='[table]\nseparator = ";"'
     ),
     "table.delimiter: ab: expected one of tab": moved(rest='[table]\ndelimiter = "ab"'),
-    "table.delimiter: 3: expected a text": moved(rest="[table]\ndelimiter = 3"),
-    "table.decimal: ;: expected one of . ,": moved(rest='[table]\ndecimal = ";"'),
+    "table: delimiter: 3: expected a text": moved(rest="[table]\ndelimiter = 3"),
+    "table: decimal: ;: expected a text matching regex": moved(
+        rest='[table]\ndecimal = ";"'
+    ),
     "table.encoding: klingon: expected": moved(rest='[table]\nencoding = "klingon"'),
-    "table.skip: -1: expected a number": moved(rest="[table]\nskip = -1"),
-    "table.names: t: expected a list of names": moved(rest='[table]\nnames = "t"'),
+    "table: skip: -1: expected a whole number >= 0": moved(rest="[table]\nskip = -1"),
+    "table: names: t: expected a list": moved(rest='[table]\nnames = "t"'),
     "table.thousands: expected another": moved(
         rest='[table]\ndecimal = ","\nthousands = ","'
     ),

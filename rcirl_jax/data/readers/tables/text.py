@@ -20,13 +20,14 @@ import re
 import string
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 
 from rcirl_jax.data.readers.tables.streams import MAX_SPAN, blocks, head_of
 from rcirl_jax.errors import InputError, extra_module
-from rcirl_jax.runtime.checked import check_names
+from rcirl_jax.runtime.checked import checked
 
 MAX_COLUMNS = 10_000  # of a table; logs have some dozens
 MOST = 0.8  # share of a head's rows that repeat their last columns
@@ -46,27 +47,23 @@ NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 
 
-def _one_of(*allowed: str) -> tuple[str, Callable[[Any], bool]]:
-    return f"one of {' '.join(allowed)}", lambda value: value in allowed
+_Count = Annotated[int, msgspec.Meta(ge=0, le=MAX_COLUMNS)]
+_Decimal = Annotated[str, msgspec.Meta(pattern=r"^[.,]$")]
+_Group = Annotated[str, msgspec.Meta(pattern=rf"^[{GROUPS}]?$")]
+_Quote = Annotated[str, msgspec.Meta(pattern=r"""^["']?$""")]
 
 
-def _is_delimiter(value: str) -> bool:
-    is_mark = len(value) == 1 and value in string.punctuation + " \t"
-    return value in DELIMITERS or is_mark
+class _Options(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+    """[table] of a source TOML; what is left out is recognised."""
 
-
-COUNT = "a number of lines or columns", range(MAX_COLUMNS + 1).__contains__
-# [table] of a source TOML: option -> its type, what is expected, whether a value is it
-OPTIONS: dict[str, tuple[type, str, Callable[[Any], bool]]] = {
-    "delimiter": (str, f"one of {', '.join(DELIMITERS)}, or a mark", _is_delimiter),
-    "decimal": (str, *_one_of(".", ",")),
-    "thousands": (str, *_one_of(*GROUPS, "")),
-    "quote": (str, *_one_of('"', "'", "")),
-    "encoding": (str, "a text", lambda _: True),
-    "skip": (int, *COUNT),
-    "names": (list, "a list of names", lambda v: all(isinstance(n, str) for n in v)),
-    "repeating": (int, *COUNT),
-}
+    delimiter: str = ""
+    decimal: _Decimal | None = None
+    thousands: _Group | None = None
+    quote: _Quote | None = None
+    encoding: str = ""
+    skip: _Count | None = None
+    names: list[str] | None = None
+    repeating: _Count | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -138,11 +135,8 @@ def recognise(
     quote = given.get("quote", "'" if is_single else '"')
     delimiter = given.get("delimiter") or _delimiter(lines, quote)
     rows = cells_of(lines, delimiter, quote)
-    header, first, has_names = (
-        given.get("names"),
-        given.get("skip", 0),
-        "names" in given,
-    )
+    header, first = given.get("names"), given.get("skip", 0)
+    has_names = header is not None
     if header is None:
         at = min(given.get("skip", _header_line(rows)), len(rows) - 1)
         header, first = [name.strip() for name in rows[at]], at + 1
@@ -188,18 +182,14 @@ def _options(path: Path, section: Mapping) -> dict[str, Any]:
     Raises:
       InputError: an unknown option, or one of another form.
     """
-    check_names(f"{path}: table.", section, [*OPTIONS])
-    for name, value in section.items():
-        kind, expected, is_right = OPTIONS[name]
-        if type(value) is not kind or not is_right(value):
-            is_text = kind is not str or isinstance(value, str)
-            raise InputError(
-                f"{path}: table.{name}: {value}: expected "
-                f"{expected if is_text else 'a text'}"
-            )
+    checked(section, _Options, f"{path}: table")
     found = dict(section)
     if "delimiter" in found:
-        found["delimiter"] = DELIMITERS.get(found["delimiter"], found["delimiter"])
+        mark = DELIMITERS.get(found["delimiter"], found["delimiter"])
+        if len(mark) != 1 or mark not in string.punctuation + " \t":
+            expected = f"one of {', '.join(DELIMITERS)}, or a mark"
+            raise InputError(f"{path}: table.delimiter: {mark}: expected {expected}")
+        found["delimiter"] = mark
     if found.get("decimal") and found.get("decimal") == found.get("thousands"):
         raise InputError(f"{path}: table.thousands: expected another than the decimal")
     return found
