@@ -32,6 +32,7 @@ from rcirl_jax.evaluation.closed_loop.suite import (
 )
 from rcirl_jax.evaluation.gate.full_suite import families_sha256, left_out_of_suite
 from rcirl_jax.evaluation.gate.types import (
+    AT_HIGHEST,
     CANDIDATE,
     DRIVES,
     INCUMBENT,
@@ -258,6 +259,8 @@ class SuiteJob:
     own: str = ""  # place of the user's own cost
     # programs that plan: names of their rows, "" for their own, and commands
     planners: tuple[tuple[str, str], ...] = ()
+    # a gate's candidate also at its highest gain everywhere, if its gain varies
+    highest: bool = False
 
     def __post_init__(self) -> None:
         """Refuses plans that are never made."""
@@ -277,7 +280,14 @@ class SuiteJob:
             own=self.own,
             planners=self.planners,
         )
-        return sorted(rows, key=lambda row: row.name != CANDIDATE)
+        rows.sort(key=lambda row: row.name != CANDIDATE)
+        first, params = rows[0], rows[0].params
+        is_candidate = self.highest and first.name == CANDIDATE
+        if is_candidate and isinstance(params, Ranking) and params.low < params.high:
+            everywhere = params.replace(low=params.high)
+            more = dataclasses.replace(first, name=AT_HIGHEST, params=everywhere)
+            rows.insert(1, more)
+        return rows
 
     def programs(self) -> dict[str, dict[str, str]]:
         """The programs that plan, by command, for provenance."""
@@ -418,6 +428,7 @@ def gate_job(
         plan_every=plan_every,
         tuned_idm=tuned_idm,
         track=track,
+        highest=CANDIDATE in files,
         own=own,
         planners=tuple(planners.items()),
     )

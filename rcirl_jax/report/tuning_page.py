@@ -69,6 +69,7 @@ CONTENTS = (
     ("own_terms", "The weights of your own terms"),
     ("cases", "Cases"),
     ("likeness", "Nearer to the human"),
+    ("decided", "How much the learned part decides"),
     ("dial", "How strongly the learned value counts"),
     ("checks", "What was tested"),
     ("families", "Families of cases"),
@@ -113,6 +114,7 @@ class TuningReport:
     workdir: Path | None  # run whose training curve is drawn
     sweep: Mapping | None  # contents of sweep.json
     dial: Mapping | None  # contents of dial.json
+    decided: Mapping  # contents of decided.json
     likeness: str  # table of held-out drives; "" without
     training_runs: int  # of which the candidate is the median one
     # why numbers may be worth nothing, by the anchor of their section
@@ -157,6 +159,7 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
         "cards": lambda: cards(verdict, suite, report.incumbent),
         "cases": lambda: case_lines(report.suite, report.incumbent, report.replays),
         "replays": lambda: player_data(report.replays),
+        "decided": lambda: decided_tables(report.decided),
         "dial": lambda: dial_view(report.dial),
         "checks": lambda: checks_tables(verdict),
         "margins": lambda: Table(
@@ -273,6 +276,25 @@ def _amount(
         "words": f"{words} {ends}",
         "kind": kind,
     }
+
+
+def decided_tables(decided: Mapping) -> list[Table]:
+    """Return shares of plans that differ from the own cost's, by family and site."""
+
+    def cells(name: str, one: Mapping) -> tuple[str, ...]:
+        share = f"{100.0 * one['share']:.0f} %"
+        if one["low"] is not None:
+            share = interval((one["share"], one["low"], one["high"]), 0, 100.0) + " %"
+        return name, share, number(one["apart_m"], 1), f"{one['moments']:,}"
+
+    heads = ("", f"plans that differ [{LEVEL}]", "apart after 5 s, m", "moments")
+    made = []
+    for part_, title in (("sites", "Held-out recordings"), ("families", "The suite")):
+        every, *rest = (cells(*item) for item in decided[part_].items())
+        rest.sort(key=lambda row: -decided[part_][row[0]]["share"])
+        rows = [every, *rest] if len(rest) > 1 else rest
+        made.append(Table(caption=title, heads=heads, rows=rows, marked=["all"]))
+    return made
 
 
 def dial_view(dial: Mapping | None) -> dict | None:

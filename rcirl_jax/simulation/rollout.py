@@ -255,6 +255,45 @@ def rollout(
     return logs, frames
 
 
+def plans_along(
+    policy: Policy, params: Sequence[Params], cases: Case, config: RolloutConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """What several weights of one policy would plan along the drives of the first.
+
+    At every moment that is looked at (`frames_every` steps) each of them chooses in the
+    same scene, among the same candidates and with the same plan in force, as if a
+    choice were due. The programs are those of the drives.
+
+    Args:
+      policy: who drives, and whose choices are compared.
+      params: P of its weights; the first drive.
+      cases: leaves [B, ...].
+      config: of the drives; with `frames_every`.
+
+    Returns:
+      Planned stations [P, B, M, T] m from the ego, and [B, M] bool: the drive lasts.
+    """
+    cases, length = _completed(cases), config.span
+    program = _compiled(policy, config.plan_every, length, config.vehicle)
+    manner = config.manner()
+    now, limits = _begin(cases)
+    stations, lasts = [], []
+    for at in range(0, config.steps, length):
+        if at % config.frames_every == 0:
+            long_ago = jnp.full_like(now.plan.since_choice, math.inf)
+            due = now.replace(plan=now.plan.replace(since_choice=long_ago))
+            seen = [
+                _unpacked(
+                    np.asarray(program(x, cases, manner, limits, due)[1])[0], cases
+                )
+                for x in params
+            ]
+            stations.append([shot.plan_s for _, shot in seen])
+            lasts.append(seen[0][0].valid)
+        now, _ = program(params[0], cases, manner, limits, now)
+    return np.moveaxis(np.array(stations), 0, 2), np.stack(lasts, axis=1)
+
+
 def _snapshot(case: Case, now: World, after: World, plan: Plan) -> Snapshot:
     time = after.step * STEP_S
     _, red = colours(case.lines, time)

@@ -34,6 +34,7 @@ from rcirl_jax.tuning.demonstrations import (
 )
 from rcirl_jax.tuning.run import Run
 from rcirl_jax.tuning.stages import (
+    compare_choices,
     dial_plan,
     gate,
     rank,
@@ -127,6 +128,7 @@ def _stages(
     made.verdict = gate(run)
     yield "report"
     turn_dial(run, sources)
+    compare_choices(run, sources)
     made.page = _drawn(run, made.verdict, recorded, sources)
 
 
@@ -232,7 +234,7 @@ def _said_of_weights(run: Run) -> str:
 
 def rows_of(job: SuiteJob) -> int:
     """Counts who drives: rewards, baselines, the tuned IDM and two who judge."""
-    return len(job.weights) + len(job.baselines) + 3
+    return len(job.weights) + job.highest + len(job.baselines) + 3
 
 
 def work_of(

@@ -16,6 +16,7 @@ RUN/ranking.json       held-out scenes as the planner sees them, beside baseline
 RUN/ranking_recorded.json   the same with recorded futures
 RUN/likeness.json      held-out drives: how near to the human (and likeness.npz, .txt)
 RUN/suite/             metrics.npz, suite.json, cases.csv, table.txt
+RUN/decided.json       how often the candidate plans otherwise than its own cost would
 RUN/dial.json          how strongly the learned value counts: drives at several gains
 RUN/dials/N.msgpack    the weights with their gain times N
 RUN/verdict.json       of the gate
@@ -47,12 +48,11 @@ from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.tuning.recipes import PriorCostConfig, SimulatedDemonstrations
 
 # what reads as permission to use weights that are no longer there
+JUDGED = ("gate", "dial", "decided", "report")
 STALE = {
-    **dict.fromkeys(
-        ("import", "demonstrate", "train"), ("export", "gate", "dial", "report")
-    ),
-    **dict.fromkeys(("export", "simulate", "likeness"), ("gate", "dial", "report")),
-    **dict.fromkeys(("rank", "gate", "dial"), ("report",)),
+    **dict.fromkeys(("import", "demonstrate", "train"), ("export", *JUDGED)),
+    **dict.fromkeys(("export", "simulate", "likeness"), JUDGED),
+    **dict.fromkeys(("rank", *JUDGED[:-1]), ("report",)),
 }
 TODAY, TERMS = "today.msgpack", "terms.yaml"
 NOTED = ("git_commit", "code_sha256", "versions", "flags")  # of every stage
@@ -161,6 +161,11 @@ class Run:
     def dial(self) -> Path:
         """Drives at several gains of the learned value on its own cost."""
         return self.folder / "dial.json"
+
+    @property
+    def decided(self) -> Path:
+        """How often the candidate plans otherwise than its own cost would."""
+        return self.folder / "decided.json"
 
     @property
     def tuned_idm(self) -> Path:

@@ -14,6 +14,7 @@ import numpy as np
 from rcirl_jax.data.store.dataset import Dataset, Demonstrations
 from rcirl_jax.evaluation.baselines import TERMS_ROW, search_own_terms, tune_idm
 from rcirl_jax.evaluation.closed_loop import dial
+from rcirl_jax.evaluation.closed_loop.decided import decided
 from rcirl_jax.evaluation.closed_loop.likeness import (
     held_out_likeness,
     read_arrays,
@@ -52,18 +53,20 @@ from rcirl_jax.report.replays import Replay, make_replays
 from rcirl_jax.runtime.atomic_files import read_json, write_json, write_whole
 from rcirl_jax.runtime.pipeline import digest, file_sha256
 from rcirl_jax.sampling import SamplerConfig
-from rcirl_jax.simulation.recorded import held_out
+from rcirl_jax.simulation.recorded import DATASET, held_out
 from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
 from rcirl_jax.simulation.suite import recorded_set
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.metrics import pairs_won
 from rcirl_jax.train.state import FUTURES
 from rcirl_jax.tuning.prior_cost import (
+    OWN_COST,
     on_own_cost,
     prior_cost_file,
     read_prior_cost,
 )
 from rcirl_jax.tuning.run import Run
+from rcirl_jax.units import HORIZON_S
 
 BASELINES = ("hand-set", "IDM", "random weights", *TRIVIAL_BASELINES)
 IDM_EVALUATIONS = 300  # of the search for the tuned IDM
@@ -348,6 +351,71 @@ def simulate(run: Run, sources: Sequence[Dataset]) -> None:
     run.stage("likeness", inputs, [arrays, body, text], compare)
 
 
+def compare_choices(run: Run, sources: Sequence[Dataset]) -> None:
+    """Says how often the candidate plans otherwise than its own cost would.
+
+    Along its drives of the dial's cases and of the held-out recordings (`decided`). The
+    own cost is the prior cost, else the user's, today's weights of own terms, or the
+    hand-set one.
+
+    Args:
+      run: folder and settings.
+      sources: what was recorded.
+    """
+    job, _ = suite_job(run)
+    prior = open_reward(str(run.weights)).prior_cost
+    name = INCUMBENT if run.config.train.reward.today else OWN_COST
+    if run.own_cost:
+        name = run.own_cost.name
+    if prior:
+        name = prior.incumbent
+    job = dataclasses.replace(job, refs=tuple(job.refs[i] for i in dial_plan(job)[1]))
+    inputs = {
+        "weights": file_sha256(run.weights),
+        "own_cost": name,
+        "cases": [ref.id for ref in job.refs],
+        "duration_s": job.duration_s,
+        "plan_every": job.plan_every,
+        "datasets": [source.hash for source in sources],
+        "drives": run.config.drives,
+    }
+
+    def work() -> None:
+        rows = {row.name: row for row in job.rows()}
+        pair, cases = (rows[CANDIDATE], rows[name]), job.cases()
+        drives, total = held_out(sources, run.config.drives), len(job.refs)
+        sites = [site_of(source, i) for i, source in enumerate(sources)]
+        found = {
+            "families": decided(
+                *pair,
+                cases.build(0, total),
+                cases.groups,
+                np.arange(total),
+                job.duration_s,
+                job.plan_every,
+            ),
+            "sites": decided(
+                *pair,
+                drives.cases,
+                [sites[number // DATASET] for number in drives.vehicle.tolist()],
+                drives.vehicle,
+                HORIZON_S,
+                job.plan_every,
+            ),
+        }
+        write_json(
+            run.decided, {"own_cost": name, **found, "made_by": run.provenance()}
+        )
+
+    run.stage("decided", inputs, [run.decided], work)
+
+
+def site_of(dataset: Dataset, number: int) -> str:
+    """Names a source by what was recorded: "0: NGSIM US-101 (...)"."""
+    names = dict.fromkeys(str(x["source"]) for x in dataset.manifest.sources)
+    return f"{number}: {', '.join(names)}"
+
+
 def dial_plan(job: SuiteJob) -> tuple[tuple[float, ...], list[int]]:
     """Returns the settings of the dial that are compared, and on which cases."""
     short = len(job.refs) * job.duration_s <= SHORT_S
@@ -492,8 +560,9 @@ def report(
         "recipe": config.recipe,
         "warnings": warnings_of(run),
     }
-    if run.dial.exists():
-        inputs["dial"] = file_sha256(run.dial)
+    for name, file in {"dial": run.dial, "decided": run.decided}.items():
+        if file.exists():
+            inputs[name] = file_sha256(file)
     if config.sweep:
         inputs["sweep"] = file_sha256(config.sweep / SWEEP)
 
@@ -510,7 +579,7 @@ def report(
             *(f"train {number}" for number in range(config.seeds)),
             "export",
             *(f"rank {futures}" for futures in FUTURES),
-            *("simulate", "likeness", "gate", "dial"),
+            *("simulate", "likeness", "gate", "dial", "decided"),
         )
         shown = {  # without `made_by`, which the page says once
             name: {key: x for key, x in stages[name].items() if key != "made_by"}
@@ -531,6 +600,7 @@ def report(
                 workdir=training_of_candidate(run),
                 sweep=read_sweep(config.sweep) if config.sweep else None,
                 dial=read_json(run.dial, "a dial") if run.dial.exists() else None,
+                decided=read_json(run.decided, "shares of plans"),
                 likeness=(run.folder / "likeness.txt").read_text(),
                 training_runs=config.seeds,
                 warnings=warnings_of(run),

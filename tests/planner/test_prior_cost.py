@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.gate.types import AT_HIGHEST
 from rcirl_jax.evaluation.ranking.score import PriorCostScorer
-from rcirl_jax.export.closed_loop import score_of, table_rows
+from rcirl_jax.export.closed_loop import SuiteJob, score_of, table_rows
 from rcirl_jax.export.loading import open_reward, reward_params, scorer_of
 from rcirl_jax.export.reader import PriorCost
 from rcirl_jax.features import feature_map
@@ -85,6 +86,15 @@ def test_a_file_with_a_prior_cost_drives_on_top_of_it(tmp_path, monkeypatch):
     rows = table_rows([path], ["IDM"])
     assert rows[0].name.endswith("on hand-set")
     assert float(rows[0].params.high) == 2.0
+    job = SuiteJob(
+        weights=(path,), names=("candidate",), baselines=("hand-set",), refs=(),
+        duration_s=1.0, highest=True,
+    )  # fmt: skip
+    shipped, everywhere, _ = job.rows()
+    assert (shipped.name, everywhere.name) == ("candidate", AT_HIGHEST)
+    assert everywhere.policy is shipped.policy
+    gains = [float(x) for x in (everywhere.params.low, everywhere.params.high)]
+    assert gains == [2.0, 2.0]
     with pytest.raises(InputError, match="without a prior cost"):
         table_rows([path], [], dp=True)
     assert reward.prior_cost is not None

@@ -85,6 +85,17 @@ def test_warnings_are_at_the_top_of_their_sections(page):
     assert page.count("<strong>Warning:</strong>") == len(WARNINGS)
 
 
+def test_shares_of_plans_are_those_of_the_file(page):
+    found = [row for row in Page(section(page, "decided")).rows if len(row) == 4]
+    share, rest = "25 [10, 40] %", ["2.0", "20"]
+    assert [x for x in found if "moments" not in x] == [
+        ["0: US-101", "25 %", *rest],
+        ["all", share, *rest],
+        ["traffic", "50 [10, 40] %", *rest],
+        ["cut_in", share, *rest],
+    ]
+
+
 def test_sections_are_linked(page):
     anchors = ANCHORS.findall(page)
     links = [a["href"] for a in Page(page).of("a") if "data-case" not in a]

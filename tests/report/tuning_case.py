@@ -25,6 +25,12 @@ from tests.helpers.weights_files import random_weights
 FAMILIES, EACH = ("stop_and_go", "cut_in", "red_light"), 40
 PLAYED = ("stop_and_go/001@0", "red_light/000@0")
 SECONDS = 5.0
+SHARE = {"moments": 20, "share": 0.25, "low": 0.1, "high": 0.4, "apart_m": 2.0}
+ONE_CLUSTER = {**SHARE, "low": None, "high": None}
+DECIDED = {
+    "sites": {"all": SHARE, "0: US-101": ONE_CLUSTER},
+    "families": {"all": SHARE, "cut_in": SHARE, "traffic": {**SHARE, "share": 0.5}},
+}
 WARNINGS = {"training": ["too few steps"], "sweep": ["its best is no better"]}
 
 
@@ -123,7 +129,8 @@ def small_report(folder, replays):
         gate=GateConfig(), suite=suite, incumbent="hand-set", ranking=ranking(),
         rewards={"candidate": candidate, "incumbent": incumbent},
         dataset=open_dataset(folder / "set"), replays=replays, workdir=workdir,
-        sweep=sweep_result(), dial=dial_result(), training_runs=3, warnings=WARNINGS,
+        sweep=sweep_result(), dial=dial_result(), decided=DECIDED, training_runs=3,
+        warnings=WARNINGS,
         facts={"flags": {"seed": 3}, "git_commit": "abc", "stages": {"train": "12ef"}},
     )  # fmt: skip
 

@@ -110,6 +110,11 @@ MAIN = {
 ORDER = ("safety", "families", "no loss", "gain", "likeness", "trivial baselines")
 
 
+def words_of(check: Check) -> Words:
+    """Returns the words of a check over all cases, whatever gain was driven at."""
+    return WORDS[check.name.partition(", ")[0]]
+
+
 def family_of(check: Check) -> str:
     """Returns the family that a check is about; "" if it is about all cases."""
     return check.name.rpartition(", ")[0] if check.kind == "families" else ""
@@ -196,7 +201,7 @@ def _listed(said: Sequence[str], count: int) -> str:
 
 def _numbers(check: Check) -> dict[str, object]:
     """Returns what the templates of `WORDS` take."""
-    words, percent = WORDS[check.name], 100.0 * check.difference
+    words, percent = words_of(check), 100.0 * check.difference
     return {
         "lost": check.lost,
         "gained": check.gained,
@@ -215,7 +220,8 @@ def _worse(check: Check, pair: Pair, crawling: bool) -> str:
         return f"is not {check.title}"
     family = family_of(check)
     if not family:
-        return WORDS[check.name].worse.format(**_numbers(check))
+        said = words_of(check).worse.format(**_numbers(check))
+        return said + (", at its highest gain" if ", " in check.name else "")
     title, at = family_title(family), np.asarray(pair.runs.groups) == family
     where = f'in "{title[:1].lower()}{title[1:]}"'
     if check.lost is not None:

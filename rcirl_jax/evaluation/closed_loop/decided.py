@@ -1,0 +1,85 @@
+"""How much the learned part decides: plans that differ from the own cost's choice.
+
+Every two seconds of its drives the candidate and its own cost alone choose in the same
+scene, among the same candidates and with the same plan in force
+(`rollout.plans_along`). A plan differs if the ego would be elsewhere at any planned
+time. Where the safety filter leaves one plan, both take it: such moments count too.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from rcirl_jax.evaluation.statistics import combine_seeds
+from rcirl_jax.simulation.cases import STEP_S, Case
+from rcirl_jax.simulation.rollout import LANES, plans_along
+from rcirl_jax.simulation.rows import Row
+from rcirl_jax.simulation.suite import rollout_config
+from rcirl_jax.units import TIMES_S
+
+EVERY_S = 2.0  # s between two moments
+SAME_M = 1e-3  # m; one plan, made by one program, is the same to the bit
+SHOWN_S = 5.0  # s at which it is said how far apart plans are
+
+
+def decided(
+    row: Row,
+    own: Row,
+    cases: Case,
+    groups: Sequence[str],
+    clusters: np.ndarray,
+    duration_s: float,
+    plan_every: int = 1,
+) -> dict[str, dict]:
+    """Returns by group how often a row plans otherwise than its own cost would.
+
+    Args:
+      row: the candidate, which drives.
+      own: its own cost, ranked by the same program.
+      cases: leaves [C, ...].
+      groups: [C] names: families, or sites.
+      clusters: [C] int, what is independent: cases, or vehicles.
+      duration_s: of a case.
+      plan_every: steps of 0.1 s between two plans.
+
+    Returns:
+      Group, or "all" -> "moments"; "share" of them in which the plan differs, with
+      "low" and "high" over clusters (of a single cluster none); and "apart_m", how far
+      apart the two plans are after `SHOWN_S` where they differ, on average.
+    """
+    config = rollout_config(row, duration_s, plan_every)
+    every = round(EVERY_S / STEP_S / config.span) * config.span
+    config = dataclasses.replace(config, frames_every=max(every, config.span))
+    count = len(groups)
+    differs, apart, lasts = [], [], []
+    for first in range(0, count, LANES):
+        # groups of one size are driven by the programs that there are
+        at = np.minimum(np.arange(first, first + LANES), count - 1)
+        some = jax.tree.map(lambda x, at=at: np.asarray(x)[at], cases)
+        plans, fine = plans_along(row.policy, (row.params, own.params), some, config)
+        gap = np.abs(plans[0] - plans[1])[: count - first]
+        differs.append(gap.max(axis=-1) > SAME_M)
+        apart.append(gap[..., np.searchsorted(TIMES_S, SHOWN_S)])
+        lasts.append(fine[: count - first])
+    valid = np.concatenate(lasts)
+    differ = np.concatenate(differs) & valid
+    gap, names = np.concatenate(apart), np.asarray(groups)
+
+    def of(at: np.ndarray) -> dict:
+        moments, many = valid[at].sum(axis=1), differ[at].sum(axis=1)
+        ends: dict[str, float | None] = {"low": None, "high": None}
+        if np.unique(clusters[at]).size > 1:
+            share = many / np.maximum(moments, 1)
+            found = combine_seeds(share, clusters[at], weight=moments.astype(float))
+            ends = {"low": max(found.low, 0.0), "high": min(found.high, 1.0)}
+        return {
+            "moments": int(moments.sum()),
+            "share": float(many.sum() / max(moments.sum(), 1)),
+            **ends,
+            "apart_m": float(gap[at][differ[at]].mean()) if many.any() else 0.0,
+        }
+
+    found = {name: of(np.flatnonzero(names == name)) for name in dict.fromkeys(groups)}
+    return {"all": of(np.arange(count)), **found}
