@@ -256,10 +256,11 @@ def work_of(
     demonstrated = DRIVEN_S * len(suite_refs("full", 1)) * cases * plan.duration_s
     recorded = config.drives * DRIVE_S
     driven = len(job.refs) * job.duration_s + recorded
-    turned = 0.0  # s that the settings of the dial drive
+    settings, cases = dial_plan(job)
+    some = len(cases) * job.duration_s + recorded  # s
+    turned = 2.0 * some  # of `compare_choices`, then the settings of the dial
     if config.prior_cost.wanted or config.train.residual_on:
-        settings, cases = dial_plan(job)
-        turned = (len(settings) - 2) * (len(cases) * job.duration_s + recorded)
+        turned += (len(settings) - 2) * some
     return {
         "demonstrate": demonstrated + (plan.rounds * learned if plan.datasets else 0.0),
         "train": config.seeds * learned,

@@ -1,7 +1,5 @@
 """How often a candidate plans otherwise than its own cost would."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -36,10 +34,9 @@ def test_shares_of_plans_that_differ():
     assert [one["moments"] for one in other.values()] == [18, 9, 9]
     assert all(one["share"] == one["apart_m"] == 0.0 for one in same.values())
     assert other["free_cruise"]["share"] > 0.2
-    assert other["free_cruise"]["apart_m"] > 0.5
+    assert other["free_cruise"]["apart_m"] > 0.1
     parts = [other[name]["share"] for name in ("free_cruise", "red_light")]
     assert other["all"]["share"] == pytest.approx(np.mean(parts))
     assert other["all"]["low"] <= other["all"]["share"] <= other["all"]["high"]
-    # of a case alone there is no interval
-    alone = dataclasses.replace(fast), own, build(refs[:1], SECONDS), ["a"], np.zeros(1)
-    assert decided(*alone, SECONDS)["a"]["low"] is None
+    assert other["free_cruise"]["low"] is None  # three cases are too few
+    assert same["all"]["high"] == pytest.approx(0.459, abs=1e-3)  # of six that never do

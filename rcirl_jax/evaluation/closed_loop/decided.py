@@ -6,13 +6,15 @@ scene, among the same candidates and with the same plan in force
 time. Where the safety filter leaves one plan, both take it: such moments count too.
 """
 
+import concurrent.futures
 import dataclasses
+import os
 from collections.abc import Sequence
 
 import jax
 import numpy as np
 
-from rcirl_jax.evaluation.statistics import combine_seeds
+from rcirl_jax.evaluation.statistics import clopper_pearson, combine_seeds
 from rcirl_jax.simulation.cases import STEP_S, Case
 from rcirl_jax.simulation.rollout import LANES, plans_along
 from rcirl_jax.simulation.rows import Row
@@ -21,6 +23,7 @@ from rcirl_jax.units import TIMES_S
 
 EVERY_S = 2.0  # s between two moments
 SAME_M = 1e-3  # m; one plan, made by one program, is the same to the bit
+FEW = 5  # clusters below which no interval over them is made
 SHOWN_S = 5.0  # s at which it is said how far apart plans are
 
 
@@ -46,34 +49,37 @@ def decided(
 
     Returns:
       Group, or "all" -> "moments"; "share" of them in which the plan differs, with
-      "low" and "high" over clusters (of a single cluster none); and "apart_m", how far
-      apart the two plans are after `SHOWN_S` where they differ, on average.
+      "low" and "high" over clusters (None where these are fewer than `FEW`); and
+      "apart_m", how far apart the two plans are after `SHOWN_S` where they differ, on
+      average.
     """
     config = rollout_config(row, duration_s, plan_every)
     every = round(EVERY_S / STEP_S / config.span) * config.span
     config = dataclasses.replace(config, frames_every=max(every, config.span))
     count = len(groups)
-    differs, apart, lasts = [], [], []
-    for first in range(0, count, LANES):
+
+    def group(first: int) -> tuple[np.ndarray, np.ndarray]:
         # groups of one size are driven by the programs that there are
         at = np.minimum(np.arange(first, first + LANES), count - 1)
-        some = jax.tree.map(lambda x, at=at: np.asarray(x)[at], cases)
+        some = jax.tree.map(lambda x: np.asarray(x)[at], cases)
         plans, fine = plans_along(row.policy, (row.params, own.params), some, config)
-        gap = np.abs(plans[0] - plans[1])[: count - first]
-        differs.append(gap.max(axis=-1) > SAME_M)
-        apart.append(gap[..., np.searchsorted(TIMES_S, SHOWN_S)])
-        lasts.append(fine[: count - first])
-    valid = np.concatenate(lasts)
-    differ = np.concatenate(differs) & valid
-    gap, names = np.concatenate(apart), np.asarray(groups)
+        return np.abs(plans[0] - plans[1])[: count - first], fine[: count - first]
+
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        made = list(pool.map(group, range(0, count, LANES)))
+    gap, valid = (np.concatenate(x) for x in zip(*made, strict=True))
+    differ = (gap.max(axis=-1) > SAME_M) & valid
+    gap, names = gap[..., np.searchsorted(TIMES_S, SHOWN_S)], np.asarray(groups)
 
     def of(at: np.ndarray) -> dict:
         moments, many = valid[at].sum(axis=1), differ[at].sum(axis=1)
         ends: dict[str, float | None] = {"low": None, "high": None}
-        if np.unique(clusters[at]).size > 1:
+        if (count := np.unique(clusters[at]).size) >= FEW:
             share = many / np.maximum(moments, 1)
             found = combine_seeds(share, clusters[at], weight=moments.astype(float))
             ends = {"low": max(found.low, 0.0), "high": min(found.high, 1.0)}
+            if not many.any():
+                ends["high"] = clopper_pearson(0, count)[1]
         return {
             "moments": int(moments.sum()),
             "share": float(many.sum() / max(moments.sum(), 1)),
