@@ -125,9 +125,8 @@ def split_batches(
     small = index.size * ROW_BYTES <= in_memory_mb * 2**20
     return BatchIterator(
         dataset.load(split) if small else dataset,
-        indices=None if small else index,
-        blocks=dataset.blocks(index),
-        numbers=index,
+        index,
+        dataset.blocks(index),
         batch_size=batch_size,
         seed=seed,
         shard_index=shard_index,
@@ -152,43 +151,32 @@ class BatchIterator:
     def __init__(
         self,
         rows: Demonstration | Demonstrations,
+        numbers: np.ndarray,
+        blocks: np.ndarray,
         *,
         batch_size: int,
         seed: int,
-        indices: np.ndarray | None = None,
-        blocks: np.ndarray | None = None,
-        numbers: np.ndarray | None = None,
         shard_index: int = 0,
         num_shards: int = 1,
     ) -> None:
         """Starts at epoch 0, position 0.
 
         Args:
-          rows: Demonstration with numpy leaves [n, ...], or an open dataset, which
-            is read as the batches need it.
+          rows: those to visit, numpy leaves [m, ...], or the dataset, which is read
+            as the batches need it.
+          numbers: [m] their numbers in the dataset.
+          blocks: [m] block of each. Equal blocks, equal order.
           batch_size: rows of a batch over all processes.
           seed: of the order of rows, >= 0.
-          indices: [m] row numbers to visit, e.g. `dataset.indices("train")`;
-            all rows when absent.
-          blocks: [m] block of each row to visit; the dataset's own when absent,
-            and one for all rows in memory. Equal blocks, equal order.
-          numbers: [m] what `next` calls each row to visit; `indices` when absent.
           shard_index: number of this process.
           num_shards: number of processes; divides `batch_size`.
 
         Raises:
           InputError: no rows, or a batch size or seed out of range.
         """
-        self._rows = rows
-        stored = not isinstance(rows, Demonstration)
-        total = rows.indices(None).size if stored else rows.vehicle.shape[0]
-        self._chosen = np.arange(total) if indices is None else np.asarray(indices)
-        if blocks is None:
-            alone = np.zeros(self._chosen.size, np.int64)
-            blocks = rows.blocks(self._chosen) if stored else alone
+        self._rows, self._numbers = rows, numbers
         self._blocks = np.unique(blocks, return_inverse=True)[1].astype(np.int32)
-        self._numbers = self._chosen if numbers is None else numbers
-        if self._chosen.size == 0:
+        if numbers.size == 0:
             raise InputError("batches: rows: 0: expected at least one scene")
         if batch_size < 1 or batch_size % num_shards or seed < 0:
             raise InputError(
@@ -205,7 +193,7 @@ class BatchIterator:
     @property
     def batches_per_epoch(self) -> int:
         """Batches of one epoch, the padded one included."""
-        return -(-self._chosen.size // self._batch_size)
+        return -(-self._numbers.size // self._batch_size)
 
     def state(self) -> dict[str, int]:
         """Returns where the next batch stands; JSON-ready, equal in every process."""
@@ -232,7 +220,7 @@ class BatchIterator:
         return self
 
     def __next__(self) -> tuple[Demonstration, np.ndarray, np.ndarray]:
-        count, size = self._chosen.size, self._batch_size
+        count, size = self._numbers.size, self._batch_size
         if self._order is None:
             self._order = epoch_order(self._seed, self._epoch, self._blocks)
             if not isinstance(self._rows, Demonstration):
@@ -241,15 +229,14 @@ class BatchIterator:
                 ahead = self._order[places % count]
                 self._stream = RowStream(
                     self._rows,
-                    self._chosen[ahead],
+                    self._numbers[ahead],
                     self._blocks[ahead],
                     self._part.size,
                 )
         places = self._position * size + self._part
         visited = self._order[places % count]
         if isinstance(self._rows, Demonstration):
-            rows = self._chosen[visited]
-            batch = jax.tree.map(lambda leaf: leaf[rows], self._rows)
+            batch = jax.tree.map(lambda leaf: leaf[visited], self._rows)
         else:
             assert self._stream is not None
             batch = next(self._stream)

@@ -18,9 +18,18 @@ from rcirl_jax.data.store.batches import (
     split_batches,
 )
 from rcirl_jax.data.store.dataset import BLOCK_ROWS, open_dataset
+from rcirl_jax.types import Demonstration
 from tests.data.store.test_dataset import make_rows, write
 
 SIZES = (300, 40, 7, 25, 60, 18)
+
+
+def all_of(rows, **settings):
+    """Batches of a dataset, or of rows in memory, which are one block."""
+    is_memory = isinstance(rows, Demonstration)
+    index = np.arange(rows.vehicle.size) if is_memory else rows.indices(None)
+    blocks = 0 * index if is_memory else rows.blocks(index)
+    return BatchIterator(rows, index, blocks, **settings)
 
 
 def take(batches, count):
@@ -35,7 +44,7 @@ def equal(one, other):
 @given(count=st.integers(1, 23), size=st.integers(1, 30), seed=st.integers(0, 2**40))
 def test_an_epoch_visits_every_row_once(count, size, seed):
     rows = make_rows(count)
-    batches = BatchIterator(rows, batch_size=size, seed=seed)
+    batches = all_of(rows, batch_size=size, seed=seed)
     for epoch in range(2):
         assert batches.state() == {"epoch": epoch, "position": 0, "seed": seed}
         seen = []
@@ -52,10 +61,10 @@ def test_an_epoch_visits_every_row_once(count, size, seed):
 @given(count=st.integers(1, 20), size=st.integers(1, 8), cut=st.integers(0, 30))
 def test_restored_iterator_continues_to_the_bit(count, size, cut):
     rows = make_rows(count)
-    batches = BatchIterator(rows, batch_size=size, seed=4)
+    batches = all_of(rows, batch_size=size, seed=4)
     take(batches, cut)
     state = json.loads(json.dumps(batches.state()))
-    resumed = BatchIterator(rows, batch_size=size, seed=4)
+    resumed = all_of(rows, batch_size=size, seed=4)
     resumed.restore(state)
     assert equal(take(resumed, 7), take(batches, 7))
     assert resumed.state() == batches.state()
@@ -133,9 +142,9 @@ def test_streamed_batches_are_those_of_memory(dataset, narrow, processes):
 def test_streams_restart_anywhere_to_the_bit(dataset, cut):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "WINDOW_BLOCKS", 3)
-        batches = BatchIterator(dataset, batch_size=16, seed=4)
+        batches = all_of(dataset, batch_size=16, seed=4)
         take(batches, cut)
-        resumed = BatchIterator(dataset, batch_size=16, seed=4)
+        resumed = all_of(dataset, batch_size=16, seed=4)
         resumed.restore(batches.state())
         assert equal(take(resumed, 5), take(batches, 5))
 
@@ -144,9 +153,8 @@ def test_a_process_reads_its_own_rows_once_an_epoch(dataset, narrow):
     read = []
     for part in range(2):
         watched = Recorded(dataset)
-        batches = BatchIterator(
-            watched, batch_size=16, seed=0, shard_index=part, num_shards=2
-        )
+        settings = {"shard_index": part, "num_shards": 2}
+        batches = all_of(watched, batch_size=16, seed=0, **settings)
         given = take(batches, batches.batches_per_epoch)
         due = np.concatenate([index for _, _, index in given])
         assert sorted(watched.rows) == sorted(due.tolist())
