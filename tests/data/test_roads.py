@@ -243,19 +243,6 @@ def test_a_lap_closes():
     assert max(step.max() for step in steps) < 26.0
 
 
-def test_lanes_of_opposite_directions_and_of_a_second_lane():
-    """A car that only jitters makes none."""
-    t = np.arange(200) * 0.1
-    there = straight(t, (0.0, 0.0), 0.0, 15.0)
-    back = straight(t, (300.0, 1.0), np.pi, 15.0)
-    beside = straight(t, (0.0, -5.0), 0.0, 15.0)
-    same = straight(t, (0.0, -1.0), 0.0, 14.0)
-    assert len(roads_from_tracks([there, back, beside, same]).lanes) == 3
-    parked, noise = straight(t, (5.0, 5.0), 0.0, 0.0), np.random.default_rng(1)
-    parked = dataclasses.replace(parked, x=5.0 + noise.normal(size=t.size))
-    assert roads_from_tracks([parked]).lanes == ()
-
-
 @pytest.mark.parametrize(("begin", "moments"), [(15.6, 96), (63.9, 96), (0.0, 1)])
 def test_a_track_whose_end_rounds_below_a_step_is_drawn_to_its_end(begin, moments):
     t = np.round(begin + 0.1 * np.arange(moments), 6)

@@ -187,41 +187,8 @@ def as_interaction(folder, name, rows):
     (folder / f"vehicle_tracks_{name}.csv").write_text("\n".join(lines) + "\n")
 
 
-def as_levelx(folder, name, rows):
-    number = "abc".index(name)
-    lines, before, seen = [LEVELX], {}, {}
-    for t, i, x, y in rows:
-        was = before.get(i, (x - 1.0, y))
-        vx, vy = 10.0 * (x - was[0]), 10.0 * (y - was[1])
-        before[i], frame = (x, y), round(10 * t)
-        seen.setdefault(i, []).append(frame)
-        heading = np.rad2deg(np.arctan2(vy, vx))
-        cells = f"{x:.2f},{y:.2f},{heading:.3f},1.8,4.5,{vx:.3f},{vy:.3f},0,0"
-        lines.append(f"{number},{i},{frame},0,{cells}")
-    metas = ["recordingId,trackId,initialFrame,finalFrame,numFrames,width,length,class"]
-    metas += [
-        f"{number},{i},{f[0]},{f[-1]},{len(f)},1.8,4.5,car" for i, f in seen.items()
-    ]
-    about = [ABOUT, f"{number},1,10,-1,0,0,6.1,50.8"]
-    tables = {"tracks": lines, "tracksMeta": metas, "recordingMeta": about}
-    for table, content in tables.items():
-        path = folder / f"{number:02d}_{table}.csv"
-        path.write_text("\n".join(content) + "\n")
-
-
-LEVELX = (
-    "recordingId,trackId,frame,trackLifetime,xCenter,yCenter,heading,width,length,"
-    "xVelocity,yVelocity,xAcceleration,yAcceleration"
-)
-ABOUT = (
-    "recordingId,locationId,frameRate,speedLimit,xUtmOrigin,yUtmOrigin,lonLocation,"
-    "latLocation"
-)
-
-
 @pytest.mark.parametrize(
-    ("form", "write"),
-    [("csv", as_csv), ("interaction", as_interaction), ("levelx", as_levelx)],
+    ("form", "write"), [("csv", as_csv), ("interaction", as_interaction)]
 )
 def test_files_of_one_place_have_its_roads_and_those_of_another_their_own(
     tmp_path, form, write

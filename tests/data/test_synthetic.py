@@ -175,15 +175,11 @@ SAME |= {"acceleration_mps2": 1.8, "deceleration_mps2": 2.0}
     ("old", "new", "field"),
     [
         ("rate_hz = 10.0", "rate_hz = -1.0", "rate_hz"),
-        ("warmup_s", "warm_up_s", "warm_up_s"),
-        ('road = "stop_sign"', 'road = "moon"', "recordings[7]: road"),
-        ("count = 6", "count = 0", "recordings[4]: count"),
         ("seed = 7", "sead = 7", "recordings[7]: sead"),
         ("density_veh_per_km = 12.0\n", "", "recordings[4]: density_veh_per_km"),
         ("duration_s = 60.0", "duration_s = nan", "recordings[1]: duration_s"),
         ("[1.0, 0.1, 0.7, 1.3]", "[1.0, 0.1]", "drivers: speed_factor"),
         ("jam_gap_m = [1.0, 4.0]", "jam_gap_m = [4.0, 1.0]", "drivers: jam_gap_m"),
-        ("politeness", "rudeness", "drivers: rudeness"),
         ("destination_share = 0.05", "destination_share = 2.0", "destination_share"),
     ],
 )

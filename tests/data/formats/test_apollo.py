@@ -8,11 +8,10 @@ import pytest
 
 from rcirl_jax.data.formats import messages as drives
 from rcirl_jax.data.formats import parts, read_recordings
-from rcirl_jax.data.formats.apollo import reader as apollo
 from rcirl_jax.types import Kind
 from tests.data.formats.fixtures import apollo as fixture
 from tests.helpers import logs
-from tests.helpers.logs import refused, tracks_of
+from tests.helpers.logs import tracks_of
 
 LOCALIZATION = "/apollo/localization/pose"
 CHASSIS = "/apollo/canbus/chassis"
@@ -100,16 +99,6 @@ def test_heading_from_the_quaternion_and_speed_of_the_chassis(tmp_path):
     for k in range(0, 21, 5):
         messages.append((CHASSIS, 0.1 * k, fixture.chassis(0.1 * k, speed=7.5)))
     np.testing.assert_allclose(only(tmp_path, messages).tracks[0].speed, 7.5)
-
-
-def test_drive_of_the_planner_is_noted(tmp_path):
-    modes = [
-        (CHASSIS, 0.5 * k, fixture.chassis(0.5 * k, manual=k == 2)) for k in range(4)
-    ]
-    made = only(tmp_path, ego_only() + modes)
-    assert has_note(made, "75% of the time not in COMPLETE_MANUAL")
-    (ego,) = made.tracks
-    np.testing.assert_allclose(ego.automated, [(-np.inf, 1.0), (1.5, np.inf)])
 
 
 def perceived(count=11, **changes):
@@ -295,17 +284,3 @@ def test_long_drive_is_read_in_windows(tmp_path, long):
     assert set(apart) == set(one)
     for key, stations in one.items():
         np.testing.assert_allclose(apart[key], stations, atol=2e-2)
-
-
-@pytest.mark.usefixtures("in_pieces")
-def test_windows_are_made_while_parts_are_read_in_order(tmp_path, long):
-    """Memory holds a window: what comes long after it is not read yet."""
-    path = in_parts(tmp_path, long, 4)
-    (tmp_path / "a.record.00003").write_bytes(b"")
-    found = apollo.recordings(path, {**logs.packaged("apollo"), "window_s": 20.0})
-    assert next(found).name == "a-000"
-    assert next(found).progress == pytest.approx(0.9, abs=0.05)
-    assert "00003: record: " in refused(list, found)
-    in_parts(tmp_path, long[800:] + long[:800], 4)
-    line = refused(read, path, window_s=10.0)
-    assert re.search(r"timestamp_sec: .*: goes backwards", line)

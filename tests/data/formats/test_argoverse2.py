@@ -1,8 +1,6 @@
 """Argoverse 2: a scenario as published, the real files, hostile Parquet and JSON."""
 
 import functools
-import json
-import shutil
 
 import numpy as np
 import pytest
@@ -102,14 +100,3 @@ def test_recorded_scenario(data_dir):
         assert 1.0 < np.median(lane.left_width) < 4.0
     away = np.hypot(*(recording.lanes[0].centre - [-436.0, 1350.0]).T)
     assert away.min() < 300.0
-
-
-@pytest.mark.dataset
-def test_recorded_map_without_centre_lines(data_dir, tmp_path):
-    """The map of a sensor log has no `centerline`; it is read alike."""
-    (real,) = (data_dir / "formats" / "argoverse2_motion").glob("*PIT*.json")
-    path, map_file = w.write_scenario(tmp_path)
-    shutil.copy(real, map_file)
-    content = json.loads(real.read_text())["lane_segments"].values()
-    driven = [lane for lane in content if lane["lane_type"] != "BIKE"]
-    assert len(only(path).lanes) == len(driven) == 180

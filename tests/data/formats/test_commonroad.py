@@ -238,14 +238,6 @@ def test_recorded_states_are_those_of_the_file(data_dir):
     assert limits <= {None, 11.176, 13.4112, 15.6464}
 
 
-@pytest.mark.dataset
-def test_reference_file_of_2018b(data_dir):
-    recording = only(data_dir / "formats" / "commonroad_2018b")
-    assert [len(track.t) for track in recording.tracks] == [61, 61]
-    assert len(recording.lanes) == 6
-    assert sum(lane.left is not None for lane in recording.lanes) == 5
-
-
 def test_intervals_become_midpoints(tmp_path):
     between = (
         "<velocity><intervalStart>14</intervalStart><intervalEnd>16</intervalEnd>"

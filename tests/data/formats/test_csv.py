@@ -202,13 +202,6 @@ def test_recorded_ngsim_subset_in_si(data_dir, tmp_path):
                 assert np.median(np.abs(track.heading)) < 0.1
 
 
-def test_far_coordinates_get_a_local_origin(tmp_path):
-    rows = [[r[0], r[1], r[2] + 691000.0, r[3] + 5334000.0, *r[4:]] for r in cars()]
-    recording = only(log(tmp_path, rows), spec(tmp_path))
-    np.testing.assert_allclose(recording.tracks[0].x, 1.5 * np.arange(40))
-    assert any("local origin" in note for note in recording.notes)
-
-
 def test_vehicles_that_have_no_rows_are_told(tmp_path):
     """In the recording that is named, or in all, less the local origin."""
     rest = "[[missing]]\ntime = [1.0, 9.0]\nx = [10.0, 90.0]\ny = [0.0, 5.0]\n"

@@ -169,13 +169,3 @@ def test_whole_numbers_are_ids_without_a_point(tmp_path):
     for name in ("log.parquet", "log.csv"):
         found = people.only(tmp_path / name, people.spec(tmp_path))
         assert [track.id for track in found.tracks] == [*"012345"]
-
-
-def test_a_log_that_lies_twice_in_a_folder_is_read_once(tmp_path):
-    (tmp_path / "log.csv").write_text(people.text(people.rows()))
-    (tmp_path / "log.parquet").write_bytes(stored(pq.write_table))
-    (tmp_path / "other.parquet").write_bytes(stored(pq.write_table))
-    more = 'pattern = ["*.csv", "*.parquet"]'
-    found = people.read(tmp_path, people.spec(tmp_path, more=more))
-    assert [made.name for made in found] == ["log", "other"]
-    np.testing.assert_allclose(found[0].tracks[0].x, found[1].tracks[0].x, atol=1e-3)

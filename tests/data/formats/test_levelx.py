@@ -7,10 +7,8 @@ import pytest
 
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.types import Kind
 from tests.data.formats.fixtures import levelx as ind
 from tests.data.formats.fixtures import levelx_highd as highd
-from tests.data.formats.fixtures import osm
 from tests.data.formats.fixtures.drives import straight
 from tests.helpers import logs
 from tests.helpers.logs import edit, lanes_of, refused, tracks_of
@@ -72,18 +70,6 @@ def test_speed_limit(motorway, text, lane, default):
 
 
 # -------------------------------------------------------------- inD and sisters
-
-
-def test_headings_in_degrees_and_sizes_of_zero(junction, tmp_path):
-    tracks = tracks_of(only(junction))
-    assert tracks["2"].heading[0] == pytest.approx(np.pi)
-    assert (tracks["3"].kind, tracks["3"].length) == (Kind.PEDESTRIAN, 0.5)
-    assert (tracks["4"].kind, tracks["4"].length) == (Kind.CYCLIST, 1.8)
-    assert tracks["2"].length == 11.5
-    source = tmp_path / "s.toml"
-    source.write_text("[sizes]\npedestrian = [0.6, 0.4]\n")
-    walker = tracks_of(only(junction, source))["3"]
-    assert (walker.length, walker.width) == (0.6, 0.4)
 
 
 def test_walkers_without_a_heading_get_that_of_their_path(tmp_path):
@@ -157,18 +143,6 @@ def test_where_maps_lie(junction, place):
     for name in ("location4_construction", "location14"):
         (target.parent / f"{name}.osm").write_text("not read")
     assert lanes_of(only(junction)).keys() >= {"30001", "30003"}
-
-
-def test_maps_of_the_source_and_of_another_place(junction, tmp_path):
-    source, other = tmp_path / "s.toml", tmp_path / "elsewhere" / "any.osm"
-    other.parent.mkdir()
-    (junction / MAP).rename(other)
-    source.write_text(f'map = "{other}"\n')
-    assert "30001" in lanes_of(only(junction, source))
-    source.write_text('map = "/nowhere/any.osm"\n')
-    assert "/nowhere/any.osm: map: missing" in refused(read, junction, source)
-    osm.lanelet_map(junction / MAP, osm.in_degrees(32, (0.0, 5.2e6)))
-    assert any("location4.osm lies elsewhere" in n for n in only(junction).notes)
 
 
 @pytest.mark.parametrize(

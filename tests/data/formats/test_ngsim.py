@@ -81,14 +81,6 @@ def test_lateral_position_from_the_lane_number(tmp_path):
     np.testing.assert_allclose(track.y[80:], -2.5 * LANE_M)
 
 
-def test_gaps_split_a_vehicle(tmp_path):
-    rows = w.ngsim_rows(first=100) + w.ngsim_rows(first=2000, start_ft=30.0)
-    del rows[20]
-    tracks = only(w.ngsim_text(tmp_path / "a.txt", rows)).tracks
-    assert [track.id for track in tracks] == ["1", "1#2", "1#3"]
-    assert [track.t.size for track in tracks] == [20, 19, 40]
-
-
 def test_csv_is_the_same_as_text(tmp_path):
     """Its columns in any order and case; also numbers as spreadsheets write them."""
     rows = w.ngsim_rows() + w.ngsim_rows(vehicle=2, local_x=30.0, lane=3)

@@ -12,7 +12,7 @@ from rcirl_jax.data.formats.nuplan import reader as nuplan
 from tests.data.formats.fixtures import nuplan as fixture
 from tests.data.formats.fixtures.nuplan import edit
 from tests.helpers import logs
-from tests.helpers.logs import lanes_of, refused, tracks_of
+from tests.helpers.logs import lanes_of, tracks_of
 
 DRIVE = "2021.06.14.21.57.33_veh-38"
 only = functools.partial(logs.only, "nuplan")
@@ -236,20 +236,3 @@ def test_missing_velocity_comes_from_positions(log):
     tracks = tracks_of(only(log))
     for name in ("ego", fixture.TRACK["12"].hex()):
         np.testing.assert_allclose(tracks[name].speed, 8.0, atol=0.1)
-
-
-def test_ego_alone_on_its_path(log):
-    edit(log, "DELETE FROM lidar_box")
-    recording = only(log)
-    assert [track.id for track in recording.tracks] == ["ego"]
-    assert recording.lanes[0].id.startswith("lane-")
-    for word in ("alone", "no map here"):
-        assert any(word in note for note in recording.notes)
-
-
-def test_maps_option(folder, tmp_path):
-    shutil.move(folder.parents[2] / "maps", tmp_path / "elsewhere")
-    assert only(folder).lanes[0].id.startswith("lane-")
-    for place in ("../elsewhere", str(tmp_path / "elsewhere")):
-        assert "61" in lanes_of(only(folder, maps=place))
-    assert "source TOML: maps: gone: no map of" in refused(only, folder, maps="gone")

@@ -142,9 +142,3 @@ def test_long_drives_are_cut(tmp_path):
         assert max(track.t[-1] for track in recording.tracks) < 10.0
     assert sum(t.t.size for r in found for t in r.tracks) == 400 + 396 + 370
     assert only(drive(tmp_path), spec(tmp_path, "block_s = 0.0\n")).name == "part1"
-
-
-def test_columns_but_no_car(tmp_path):
-    columns = {"Time": ["0.0", "0.1"], "IVS1": ["1", "2"]}
-    line = logs.refused(read, drive(tmp_path, columns))
-    assert "expected Speed1, E1, N1" in line

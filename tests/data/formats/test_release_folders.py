@@ -2,14 +2,11 @@
 
 import pytest
 
-from rcirl_jax.data.formats import parts, read_part, read_recordings
-from rcirl_jax.data.importing import digest
+from rcirl_jax.data.formats import parts, read_part
 from rcirl_jax.errors import InputError
 from tests.data.formats import writers as w
 from tests.data.formats.fixtures import (
     format_of,
-    interaction,
-    interaction_challenge,
     modules,
     openacc,
 )
@@ -88,16 +85,3 @@ def test_sumo_beside_commonroad(tmp_path):
     (tmp_path / "broken.xml").write_text("<scenario/>")
     with pytest.raises(InputError, match=r"broken\.xml: root: 'scenario': expected"):
         names("commonroad", tmp_path)
-
-
-@pytest.mark.parametrize("writer", [interaction, interaction_challenge])
-def test_other_tables_beside_interaction_logs(tmp_path, writer):
-    place = writer.write(tmp_path).input
-    before = [digest(one) for one in read_recordings("interaction", place)]
-    (place / "readme.csv").write_text("a,a,note\n1,2,see the paper\n")
-    (place / "scenes.csv").write_bytes(b"\xff\xfe\x00")
-    assert [digest(one) for one in read_recordings("interaction", place)] == before
-    if writer is interaction:
-        (place / "vehicle_tracks_007.csv").write_text("a,b\n1,2\n")
-        with pytest.raises(InputError, match=r"_007\.csv: column track_id: missing"):
-            names("interaction", place)

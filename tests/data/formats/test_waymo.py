@@ -7,7 +7,6 @@ import struct
 import numpy as np
 import pytest
 
-from rcirl_jax.data.formats import shapes
 from rcirl_jax.data.readers.tfrecord import read_records
 from rcirl_jax.types import Kind
 from tests.data.formats.fixtures import waymo as w
@@ -149,16 +148,6 @@ def test_boundaries_of_a_part_far_ones_and_unknown_ones(tmp_path):
     np.testing.assert_allclose(lane.right_width, 1.75)
 
 
-def test_distances_from_a_bent_line_and_from_a_point(monkeypatch):
-    monkeypatch.setattr(shapes, "CHUNK", 4)
-    bent = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 5.0]]) + 4e6
-    points = np.array([[5.0, 2.0], [-3.0, 4.0], [12.0, 9.0], [10.0, 3.0]] * 2) + 4e6
-    lines, which = [bent, bent[:1]], np.repeat([0, 1], 4)
-    away = shapes.distances_to_lines(points, lines, which)
-    expected = [2.0, 5.0, 20**0.5, 0.0, 29**0.5, 5.0, 15.0, 109**0.5]
-    np.testing.assert_allclose(away, expected, atol=1e-9)
-
-
 def test_exits_entries_and_the_longest_neighbour(tmp_path):
     rows = [w.eastward(0.0, 40.0 * k, 40.0 * k + 40.0) for k in range(3)]
     beside = [w.neighbour(3, 0, 9), w.neighbour(2, 10, 60)]
@@ -224,15 +213,6 @@ def test_every_state(tmp_path, state, colour):
     # flashing red is a stop sign in effect
     assert lane.stop_sign == (state == 7)
     assert lane.stop_line is None  # no stop point was given
-
-
-def test_short_gaps_between_equal_colours(tmp_path):
-    states = [4] * 20 + [0] * 10 + [4] * 10 + [None] * 30 + [4] * 10 + [0] * 5 + [6] * 6
-    (signal,) = shown(tmp_path, states).signals
-    assert signal.state == ("red", "off", "red", "off", "green")
-    np.testing.assert_allclose(signal.start, [0.0, 4.0, 7.0, 8.0, 8.5], atol=1e-3)
-    (signal,) = shown(tmp_path, states, signal_gap_s=0.0).signals
-    assert signal.state[:3] == ("red", "off", "red")
 
 
 # -------------------------------------------------------------------- framing
