@@ -63,13 +63,7 @@ class _Samples:
     def around(
         self, place: np.ndarray, way: np.ndarray, label: str
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns numbers, m along and m to the left of samples that go the same way.
-
-        Args:
-          place: [2] m.
-          way: [2] unit vector.
-          label: only samples of it; "": all.
-        """
+        """Returns numbers, m along, m to the left of samples that go the same way."""
         near = np.array(self.tree.query_ball_point(place, ALONG_M + REACH_M), int)
         gap = self.place[near] - place
         along, left = gap @ way, gap @ [-way[1], way[0]]
@@ -192,14 +186,7 @@ class _Tracer:
     def trace(
         self, place: np.ndarray, way: np.ndarray, label: str, sense: float
     ) -> tuple[list[np.ndarray], list[int], int]:
-        """Follows the ridge from a place; returns points, tracks, ridge that it joins.
-
-        Args:
-          place: [2] m, on it.
-          way: [2] of travel.
-          label: of the samples.
-          sense: 1: ahead, -1: back.
-        """
+        """Follows a ridge ahead or back: points, tracks, number of the one it joins."""
         points, counts = [], []
         begin = place
         while len(points) < 20_000:
@@ -377,13 +364,7 @@ class _Link:
 
 
 def _led_onto(ridge: _Ridge, is_end: bool, target: np.ndarray, blend: float) -> int:
-    """Leads the end of a ridge onto the middle of another.
-
-    Args:
-      ridge: its line is replaced by a longer one.
-      is_end: its end; else its start.
-      target: [m, 2] m, the line of the ridge that it joins.
-      blend: m in which it does.
+    """Leads an end of a ridge's line onto the middle of another, within `blend` m.
 
     Returns:
       The target's point at which the two are one.
@@ -411,13 +392,6 @@ def _ends_beside(
 
     Where it drifts onto the other, drivers change lanes: from there it goes along the
     other, as far as some still drive on it and EXTRA_M beyond.
-
-    Args:
-      ridge: its line is replaced.
-      is_end: its end; else its start.
-      target: [m, 2] m, the line of the ridge on which its drivers go on.
-      width: m between lanes that adjoin.
-      samples: of all ridges.
 
     Returns:
       False if the two do not run side by side; then nothing is changed.
@@ -606,12 +580,7 @@ def _on_those(
 def _connected(
     ridges: list[_Ridge], samples: _Samples, width: float
 ) -> tuple[set[tuple[int, bool]], list[_Link]]:
-    """Leads the ends of ridges onto those that follow, or leaves them beside these.
-
-    Args:
-      ridges: all; their lines are replaced.
-      samples: that they are made of.
-      width: m of a lane, where none adjoins.
+    """Leads the lines of ridges onto those that follow, or ends them beside these.
 
     Returns:
       (ridges that end beside another, and whether it is their end; the links).
@@ -671,16 +640,7 @@ def _pieces(
     width: float,
     limit: float | None,
 ) -> tuple[Lane, ...]:
-    """Cuts ridges where others join, leave, begin or end beside them: lanes.
-
-    Args:
-      ridges: all.
-      beside: of each.
-      links: of all.
-      ended: ridges, and whether it is their end, that end beside another.
-      width: m, where no lane is beside.
-      limit: m/s, or None.
-    """
+    """Cuts ridges where others join, leave, begin or end beside them: lanes."""
     last = [len(ridge.line) - 1 for ridge in ridges]
     fixed = [
         {link.at for link in links if link.other == n} | {0, end}

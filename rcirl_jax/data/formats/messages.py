@@ -151,11 +151,7 @@ class Drive(abc.ABC):
         yield
 
     def _take_in(self) -> None:
-        """Appends the rows that are new.
-
-        Raises:
-          InputError: too many, too long a drive, or rows of windows long taken.
-        """
+        """Appends the rows that are new."""
         for role, values in self._new.items():
             rows = np.array(values).reshape(-1, self.widths[role])
             self.tables[role] = np.concatenate([self.tables[role], rows])
@@ -252,12 +248,7 @@ class Drive(abc.ABC):
     def _recording(
         self, within: tuple[float, float], held: tuple[float, float]
     ) -> Recording | None:
-        """The recording of the rows between two times [s]; None: nobody is there.
-
-        Args:
-          within: s, when its scenes begin.
-          held: s, of the rows.
-        """
+        """The recording of the rows held; None: nobody is there. Times in s."""
         view, self.notes = copy.copy(self), []
         view.tables = self._tables(*held)
         return view.recording(within)

@@ -255,13 +255,7 @@ class _Map(msgspec.Struct):
 def _lanes(
     path: Path, origin: np.ndarray, spec: dict
 ) -> tuple[tuple[Lane, ...], list[str]]:
-    """Reads lanes of the wanted types, with notes on what was left out.
-
-    Args:
-      path: the map.
-      origin: [2] m, subtracted from all points.
-      spec: source TOML; `lane_types` names the types that are read.
-    """
+    """Reads lanes of the wanted types, with notes on what was left out."""
     wanted = lane_types(spec, LANE_TYPES, DRIVEN)
     content = read_json(path, "JSON", MAX_FILE_BYTES)
     segments = [

@@ -47,12 +47,7 @@ def read_lanes(root: Node, spec: dict) -> tuple[tuple[Lane, ...], list[str]]:
 
 
 def _signs(root: Node, lowest: float) -> tuple[dict[str, float], set[str], list[str]]:
-    """Limits [m/s] by the ids of signs, ids of stop signs, notes.
-
-    Args:
-      root: of the file.
-      lowest: m/s; limits below are taken for none.
-    """
+    """Limits [m/s] from `lowest` on by the ids of signs, ids of stop signs, notes."""
     country = root.element.get("benchmarkID", "").removeprefix("C-")[:COUNTRY]
     own = [*LIMITS_AND_STOPS.values()]  # where it names none, or Zamunda
     if country.isalpha() and country.isupper() and country != "ZAM":

@@ -210,12 +210,7 @@ def _first_rows(path: Path, spec: Mapping) -> tuple[Log, Rows]:
 
 
 def _guess_time_form(table: Table, guess: _Guess) -> None:
-    """Unit of times that are no seconds, milliseconds or frames: by the first cell.
-
-    Raises:
-      InputError: latitudes are no degrees; of raw numbers nobody knows how many make
-        one.
-    """
+    """Unit of times that are no seconds, milliseconds or frames: by the first cell."""
     first = first_cell(table, guess.columns["t"])
     if re.match(r"\d{4}[-/]\d|\d{8}T\d|\d{1,2}:\d", first):
         guess.units["t"] = "iso"

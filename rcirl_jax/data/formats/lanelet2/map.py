@@ -195,12 +195,7 @@ def _resample_both(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 class _World:
-    """The elements of a file by id.
-
-    Args:
-      path: of the file.
-      project: of `read_lanelet2`.
-    """
+    """The elements of a file by id."""
 
     def __init__(self, path: Path, project: Projection) -> None:
         self.path = path

@@ -117,11 +117,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
 
 
 def _open(path: Path, spec: dict) -> tuple[Table, RowStats]:
-    """The portal's table, or the native text, whose columns the TOML names.
-
-    Raises:
-      InputError: a column is missing, or it is an arterial's file.
-    """
+    """The portal's table, or the native text, whose columns the TOML names."""
     table, stats = open_log(path, spec)
     is_known = any(table.has(column) for column, _ in NEEDED.values())
     is_numeric = not any(c.isalpha() for c in "".join(table.header))

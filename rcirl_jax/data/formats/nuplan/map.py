@@ -159,12 +159,7 @@ class _Package:
         return [(line, *row[1:]) for line, row in zip(lines, table, strict=True)]
 
     def lines(self, layer: str, blobs: Sequence[object]) -> list[np.ndarray]:
-        """Returns [n, 2] m of each geometry of a layer.
-
-        Raises:
-          InputError: a blob that is no geometry, an unknown system, or a place
-            outside of it.
-        """
+        """Returns [n, 2] m of each geometry of a layer."""
         if not blobs:
             return []
         column, system = self.geometry(layer)

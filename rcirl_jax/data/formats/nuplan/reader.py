@@ -123,14 +123,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
 
 
 class _Log:
-    """A log: its ego poses and road users, and recordings of their boxes.
-
-    Args:
-      database: opened.
-      name: of its recordings.
-      road: the city.
-      spec: source TOML.
-    """
+    """A log: its ego poses and road users, and recordings of their boxes."""
 
     def __init__(
         self, database: Database, name: str, road: NuplanMap | None, spec: dict

@@ -140,10 +140,6 @@ def _read_drive(
     """(t [n] s from 0, cars by their numbers, date, notes) of a file.
 
     Cars without positions are left out; column names stand below the metadata.
-
-    Raises:
-      InputError: no table of a drive, a column of a car met twice, or numbers beyond
-        any place, speed or time.
     """
     lines, header = _first_lines(path)
     if not header:

@@ -106,9 +106,6 @@ class BagDrive(Drive):
         """Topic -> role: of each role the first topic named that has messages.
 
         One that nobody can read is noted and passed over, unless it has to be there.
-
-        Raises:
-          InputError: a needed role has none, or its type is unknown.
         """
         known: dict[str, Topic] = {}
         for file in self.files:

@@ -170,12 +170,7 @@ def head_of(
 
 
 def _by_names(data: bytes, known: Collection[str]) -> tuple[str, bool]:
-    """Returns the encoding in which most names are found, and whether it is a guess.
-
-    Args:
-      data: first bytes of a text in one of `UNTOLD`.
-      known: names; those of ASCII alone are alike in all.
-    """
+    """Returns the encoding in which most names are found, and whether it is a guess."""
     names = {name.casefold() for name in known if not name.isascii()}
     texts = {name: data.decode(name, "replace").casefold() for name in UNTOLD}
     found = {name: sum(n in text for n in names) for name, text in texts.items()}

@@ -177,11 +177,7 @@ def recognise(
 
 
 def _options(path: Path, section: Mapping) -> dict[str, Any]:
-    """Returns [table] of a source TOML, checked.
-
-    Raises:
-      InputError: an unknown option, or one of another form.
-    """
+    """Returns [table] of a source TOML, checked."""
     checked(section, _Options, f"{path}: table")
     found = dict(section)
     if "delimiter" in found:
