@@ -20,7 +20,7 @@ import tensorstore as ts
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import parse_json
-from rcirl_jax.runtime.pipeline import LOCK, only_one
+from rcirl_jax.runtime.pipeline import LOCK, digest, only_one
 
 MANIFEST, MARK, SHARDS = "manifest.json", "shard.json", "shards/"
 PLANS = "plans.json"  # of the sites of the first recordings
@@ -184,14 +184,9 @@ def describe(data: bytes) -> FileEntry:
     return {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
 
-def _canonical(payload: Mapping) -> str:
-    text = json.dumps(payload, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
 def seal(payload: Mapping, field: str) -> bytes:
     """Returns JSON bytes of the payload with its own digest as one more field."""
-    whole = {**payload, field: _canonical(payload)}
+    whole = {**payload, field: digest(payload)}
     return (json.dumps(whole, sort_keys=True, indent=1) + "\n").encode()
 
 
@@ -209,7 +204,7 @@ def unseal(raw: bytes, field: str, name: str) -> dict[str, Any]:
             f"{name}: schema_version: {found}: expected {SCHEMA_VERSION}; "
             "import the logs again with this version"
         )
-    sha = _canonical({k: v for k, v in payload.items() if k != field})
+    sha = digest({k: v for k, v in payload.items() if k != field})
     if sha != payload.get(field):
         raise InputError(
             f"{name}: {field}: contents {sha}: expected {payload.get(field)}; damaged"

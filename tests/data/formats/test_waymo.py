@@ -229,7 +229,3 @@ def test_records_are_read_one_by_one_up_to_a_limit(tmp_path):
     assert "expected at most 10485" in refused(read, path, max_record_mib=0.01)
     path.write_bytes(gzip.compress(path.read_bytes()))
     assert "gzip data: expected an uncompressed TFRecord file" in refused(read, path)
-
-
-TWO = [w.shown(4)] * 91
-TWO = [{"lane_states": [*row["lane_states"], {"lane": 106, "state": 4}]} for row in TWO]

@@ -153,21 +153,6 @@ def ngsim_csv(path: Path, rows, *, columns=NGSIM_COLUMNS, sites=None):
     return table(path, header, [r + t for r, t in zip(rows, tails, strict=True)])
 
 
-def grouped(path: Path):
-    """The CSV with numbers as spreadsheets write them: "1,118,846,979,700"."""
-    lines = path.read_text().splitlines()
-    rows = [[_grouped(cell) for cell in line.split(",")] for line in lines[1:]]
-    return table(path, lines[0].split(","), rows)
-
-
-def _grouped(cell):
-    try:
-        value = float(cell)
-    except ValueError:
-        return cell
-    return f"{value:,}".removesuffix(".0")
-
-
 def table(path: Path, header, rows):
     """Write a CSV."""
     with path.open("w", newline="") as handle:

@@ -92,9 +92,8 @@ def unpacked(path: Path) -> Iterator[tuple[Any, IO[bytes]]]:
             with arrow.CompressedInputStream(arrow.PythonFile(file), packed) as stream:
                 yield stream, file
         except (OSError, arrow.ArrowException) as error:
-            why = " ".join(str(error).split())[:200]
             raise InputError(
-                f"{path}: {packed}: {why}: expected a whole file"
+                f"{path}: {packed}: {str(error)[:200]}: expected a whole file"
             ) from error
 
 
@@ -112,9 +111,8 @@ def _text(path: Path, encoding: str) -> Iterator[tuple[io.TextIOWrapper, IO[byte
         try:
             yield made, file
         except (TypeError, UnicodeError) as error:  # no text, or no mark of utf-16
-            why = " ".join(str(error).split())[:100]
             raise InputError(
-                f"{path}: text: {why}: expected {encoding[:40]}"
+                f"{path}: text: {str(error)[:100]}: expected {encoding[:40]}"
             ) from error
         finally:
             made.detach()
