@@ -25,10 +25,6 @@ KINDS = {Kind.VEHICLE: "vehicle", Kind.CYCLIST: "cyclist"}
 def plan_of(recording: Recording, graph: LaneGraph) -> dict[str, Any]:
     """Makes the plan of a recording, JSON-ready.
 
-    Args:
-      recording: as it was imported.
-      graph: of its lanes.
-
     Returns:
       name; lanes: id, centre [[x, y]] m, left and right m, limit m/s or null, assumed,
       stop_line; tracks: kind, points [[x, y, heading rad, speed m/s]]; changes of lane

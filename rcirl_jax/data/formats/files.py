@@ -24,13 +24,7 @@ TABLE_ENDINGS = (".csv", ".tsv", ".txt", ".parquet", ".feather", ".arrow")
 def files_below(
     path: Path, patterns: str | Sequence[str], what: str = "log files"
 ) -> list[Path]:
-    """Returns the file itself, or those at any depth that match a pattern, sorted.
-
-    Args:
-      path: file or folder.
-      patterns: of file names.
-      what: is said to be expected.
-    """
+    """Returns the file itself, or those at any depth that match a pattern, sorted."""
     if path.is_file():
         return [path]
     wanted = [patterns] if isinstance(patterns, str) else patterns
@@ -75,12 +69,6 @@ def with_log_names(
     """Returns the spec, with names for logs that are called alike in several folders.
 
     Their relative folder comes first (FOLDER/NAME); every other log keeps its name.
-
-    Args:
-      path: folder of the input.
-      files: its logs.
-      spec: source TOML.
-      name_of: name of a log by its file.
     """
     met = collections.Counter(name_of(file) for file in files)
     names = {

@@ -61,13 +61,7 @@ class Drive(abc.ABC):
     role "ego": x, y [m], heading [rad], speed [m/s], NaN where it is not known; of
     "velocity": speed [m/s]; of "driver": 1 where a human drives; of obstacles: number,
     x, y [m], heading [rad], speed [m/s], length, width [m], kind. More columns may
-    follow, and other roles.
-
-    Args:
-      path: file that errors name.
-      spec: source TOML.
-      name: of the drive's recordings.
-      group: vehicle-disjoint group of its windows; default: its name.
+    follow, and other roles. Windows of one drive are one vehicle-disjoint group.
     """
 
     widths: ClassVar[Mapping[str, int]]  # role -> number of columns
@@ -362,12 +356,7 @@ def around(within: tuple[float, float]) -> tuple[float, float]:
 
 
 class Windows:
-    """Windows of one long drive: each road user has one name in all of them.
-
-    Args:
-      drive: its name.
-      group: vehicle-disjoint group of all its windows.
-    """
+    """Windows of one long drive: each road user has one name in all of them."""
 
     def __init__(self, drive: str, group: str) -> None:
         self.drive, self.group = drive, group

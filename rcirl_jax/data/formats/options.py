@@ -157,11 +157,6 @@ def check_options(spec: Mapping, packaged: Mapping, form: Format) -> None:
 
     In a table whose values are all of one type any value is of that type.
 
-    Args:
-      spec: the user's own TOML.
-      packaged: that of the format.
-      form: what the format says of itself.
-
     Raises:
       InputError: the first one that is not known (with the nearest that is), or has
         another type.

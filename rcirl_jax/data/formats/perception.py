@@ -93,11 +93,6 @@ def on_clock(boxes: Boxes, rate_hz: float, max_gap_s: float) -> Boxes:
     Linear interpolation; headings are unwrapped first, series of which some values are
     not known are those of the row at or after the tick. A piece between two ticks of
     the clock gives nothing. Of several rows of one road user and time the first counts.
-
-    Args:
-      boxes: in any order.
-      rate_hz: of the clock.
-      max_gap_s: s between two rows of one piece.
     """
     ids, t = boxes.ids, boxes.t
     order = np.lexsort((t, ids))
@@ -223,10 +218,6 @@ def without_outliers(
 
     Keeps all, for validation to refuse, if more than MAX_OUTLIERS are impossible, and
     more than one of ONE_OF or more.
-
-    Args:
-      tracks: of one recording.
-      is_possible: default: by size and speed.
     """
     good = [track for track in tracks if (is_possible or _is_possible)(track)]
     lost = len(tracks) - len(good)

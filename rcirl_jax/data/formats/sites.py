@@ -36,12 +36,6 @@ def with_roads(name: str, read: Read, path: Path, spec: dict) -> Iterator[Record
     """Yields the recordings of a file, with estimated lanes where it gives none.
 
     Those of the only file are taken alone, unless they are pieces of a long one.
-
-    Args:
-      name: of the format.
-      read: gives the recordings of a file by a spec.
-      path: of one part of the input.
-      spec: source TOML, with the files `beside`.
     """
     files = [Path(file) for file in spec.get(BESIDE, [str(path)])]
     for made in read(path, spec):
@@ -70,13 +64,7 @@ def with_roads(name: str, read: Read, path: Path, spec: dict) -> Iterator[Record
 
 
 class Sites:
-    """The sites that files show, and the roads of each.
-
-    Args:
-      read: gives the recordings of a file by a spec.
-      files: that are read for it.
-      spec: source TOML.
-    """
+    """The sites that files show, and the roads of each."""
 
     def __init__(self, read: Read, files: Sequence[Path], spec: dict) -> None:
         self._read, self._spec = read, spec

@@ -85,10 +85,6 @@ def once_each(ids: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, list[str]]:
 
     The first of several counts. All rows where too many are doubled: then the file is
     wrong, and `split_tracks` says so.
-
-    Args:
-      ids: [m] of each row.
-      t: [m] in any unit.
     """
     order = np.lexsort((t, ids))  # stable: the file's order inside
     same = (np.diff(ids[order]) == 0) & (np.diff(t[order]) == 0.0)

@@ -16,10 +16,6 @@ def reading(path: Path, files: Sequence[Path]) -> Iterator[Callable[[int], objec
 
     The bar stands below that of the import, shows bytes/s and the time left, and
     goes when all is read. Processes that the import started show none.
-
-    Args:
-      path: named in the bar.
-      files: all that will be read.
     """
     with tqdm.tqdm(
         total=sum(file.stat().st_size for file in files if file.is_file()),

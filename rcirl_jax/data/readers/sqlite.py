@@ -108,14 +108,7 @@ class Database:
     def table(
         self, name: str, columns: Sequence[str], most: int, optional: Sequence[str] = ()
     ) -> list[tuple]:
-        """Returns all rows: the columns, which have to be there, and optional ones.
-
-        Args:
-          name: of the table.
-          columns: their names, which the file may have chosen.
-          most: rows allowed.
-          optional: other columns, or NULL where there are none.
-        """
+        """Returns all rows: the columns, which have to be there, and optional ones."""
         known = self.need(name, columns)
         chosen = [_quoted(column) for column in columns]
         chosen += [_quoted(one) if one in known else "NULL" for one in optional]
@@ -127,11 +120,7 @@ class Database:
     ) -> np.ndarray:
         """Returns [rows, columns] float64 of a query of numbers; NULL is NaN.
 
-        Args:
-          sql: a SELECT.
-          names: of its columns, for errors.
-          most: rows allowed.
-          values: of its parameters.
+        At most `most` rows are allowed; `names` of its columns are for errors.
         """
         parts = [np.zeros((0, len(names)))]
         for rows in self.chunks(sql, names, most, values):

@@ -21,11 +21,7 @@ GZIP_MAGIC = b"\x1f\x8b"
 
 
 def read_records(path: Path, limit: int = MAX_RECORD_BYTES) -> Iterator[bytes]:
-    """Yields the data of each record of an uncompressed TFRecord file.
-
-    Args:
-      path: file.
-      limit: bytes of the longest record that is read.
+    """Yields the data of each record, of `limit` bytes at most, uncompressed.
 
     Raises:
       InputError: damaged, truncated, compressed or empty file; a longer record.

@@ -15,11 +15,6 @@ from rcirl_jax.errors import InputError
 def read_xml(path: Path, tag: str, max_bytes: int) -> Element:
     """Reads the root element, which has to be called `tag`.
 
-    Args:
-      path: of the file.
-      tag: of its root.
-      max_bytes: larger files are refused.
-
     Raises:
       InputError: too large a file, a DTD, entities or external references, XML
         that is not well formed, or another root.
@@ -46,12 +41,7 @@ def read_xml(path: Path, tag: str, max_bytes: int) -> Element:
 
 
 class Node:
-    """An element and its place.
-
-    Args:
-      element: of a file.
-      where: the file and the element's place in it, first in errors.
-    """
+    """An element and its place, which is first in errors."""
 
     def __init__(self, element: Element, where: str) -> None:
         self.element, self.where = element, where

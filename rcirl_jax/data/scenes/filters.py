@@ -59,10 +59,6 @@ def reject_motion(row: dict, config: CollectConfig) -> str | None:
     """Returns the first reason to drop a scene for how its human drives, or None.
 
     Asked before anybody else is looked at: where traffic flows this drops most.
-
-    Args:
-      row: the scene's flat arrays, without obstacles.
-      config: which filters are on.
     """
     valid, s, l = row["time_valid"], row["human.s"], row["human.l"]
     left = np.interp(s, GRID_M, row["path.road_left"])

@@ -177,9 +177,6 @@ def check_events(recorded: Iterable[LineEvents]) -> list[PhaseCheck]:
 
     Lines are the same if their signals' ids are and the recordings' names agree up to
     the last "-", as in CommonRoad's names of places.
-
-    Args:
-      recorded: what the recordings say, one after the other.
     """
     events: LineEvents = collections.defaultdict(list)
     for lines in recorded:

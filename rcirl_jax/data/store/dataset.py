@@ -148,12 +148,7 @@ def layout(shape: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 
 def shard_info(files: Files, index: int, sha256: str | None = None) -> ShardInfo:
-    """Reads shard.json.
-
-    Args:
-      files: of the dataset.
-      index: number of the shard.
-      sha256: that the manifest states, if there is one.
+    """Reads shard.json, whose sha256 the manifest may state.
 
     Raises:
       InputError: it is not there, or not as written.
@@ -186,7 +181,7 @@ def shard_info(files: Files, index: int, sha256: str | None = None) -> ShardInfo
 
 
 def verify_shard(files: Files, index: int, sha256: str | None = None) -> ShardInfo:
-    """Reads all of a shard against its checksums; arguments as `shard_info`.
+    """Reads all of a shard against its checksums.
 
     Raises:
       InputError: names the shard and the file at fault.

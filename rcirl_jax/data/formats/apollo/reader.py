@@ -178,10 +178,6 @@ class ApolloDrive(Drive):
 
     Where topics are stamped on different clocks, the times of recording, in the last
     column, are common to all.
-
-    Args:
-      run: its files.
-      spec: source TOML.
     """
 
     widths = WIDTHS

@@ -42,11 +42,7 @@ Channel: name 1 string, message_type 2 string
 
 
 class Run:
-    """A record and, if it is a part, those that follow: .00000, .00001, ...
-
-    Args:
-      first: its first file.
-    """
+    """A record and, if it is a part, those that follow: .00000, .00001, ..."""
 
     def __init__(self, first: Path) -> None:
         match = NAME.fullmatch(first.name)

@@ -119,12 +119,7 @@ def _numbers(texts: Sequence[str], decimal: str, thousands: str) -> np.ndarray:
 
 
 def fields_by_content(table: Table, found: Mapping[str, str]) -> dict[str, Guessed]:
-    """Returns fields that content tells and that `found` lacks, where it is clear.
-
-    Args:
-      table: whose columns are asked.
-      found: field -> column, by names.
-    """
+    """Returns fields that content tells and that `found` lacks, where it is clear."""
     head = head_of_table(table)
     known = {f: c for f, c in found.items() if c in head.codes}
     made: dict[str, Guessed] = {}

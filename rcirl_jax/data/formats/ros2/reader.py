@@ -58,12 +58,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
 
 
 class BagDrive(Drive):
-    """Rows of a bag, by the headers' stamps.
-
-    Args:
-      bag: folder or file.
-      spec: source TOML.
-    """
+    """Rows of a bag, by the headers' stamps."""
 
     widths = WIDTHS
 

@@ -152,10 +152,6 @@ def plan(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draws all cars of a recording, and the offset of each light into its cycle.
 
-    Args:
-      run: the recording.
-      drivers: distribution of each parameter of DRIVER.
-
     Returns:
       Cars [n] of CAR, by lane and time; offsets [lights] s.
     """
@@ -288,12 +284,7 @@ class Neighbours:
 
 
 class Traffic:
-    """Batch of simulated recordings of equal duration, rate and warm-up.
-
-    Args:
-      runs: one per recording.
-      drivers: distribution of each parameter of DRIVER.
-    """
+    """Batch of simulated recordings of equal duration, rate and warm-up."""
 
     def __init__(
         self, runs: Sequence[RunConfig], drivers: Mapping[str, Sequence[float]]
