@@ -320,12 +320,6 @@ class _World:
         for one in lanelets:
             left, right = _resample_both(self._line(one.left), self._line(one.right))
             name = one.id.removesuffix(BACKWARDS)
-            own = (name, name + BACKWARDS)
-            following = [
-                other
-                for other in starts.get(self._gate(one, -1), [])
-                if other not in own
-            ]
             refs = [ref for kind, _, ref in one.element.members if kind == "relation"]
             rules = [self.rules[r] for r in dict.fromkeys(refs) if r in self.rules]
             limits = [rule.limit for rule in rules if rule.limit is not None]
@@ -338,7 +332,7 @@ class _World:
                 speed_limit=limits[-1],  # of the last rule, or of the lanelet itself
                 successors=tuple(
                     other
-                    for other in following
+                    for other in starts.get(self._gate(one, -1), ())
                     if other.removesuffix(BACKWARDS) != name
                 ),
                 left=rights.get(one.left),
