@@ -71,13 +71,7 @@ def read_log(
 ) -> Rows:
     """Returns the rows of a table, each road user once in a frame.
 
-    Args:
-      table: of `open_log`.
-      stats: of it, which counts what is dropped.
-      needed: as of `fields_of`.
-      optional: likewise.
-      columns: likewise.
-      **options: of `drop_duplicates`.
+    Columns are given as to `fields_of`, other options as to `drop_duplicates`.
     """
     fields = fields_of(table, needed, optional, columns=columns)
     return drop_duplicates(read(table, fields, stats), stats, **options)

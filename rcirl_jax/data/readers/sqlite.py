@@ -85,8 +85,10 @@ class Database:
         kinds += " AND type IN ('table', 'view')"
         for rows in self.chunks(kinds, (table,), values=(table,)):
             ((kind, text), *_) = rows
-            if kind != "table" or "virtual" in str(text).lower().split()[1:2]:
-                raise self.error(table, f"a view or virtual {kind}", "a table")
+            is_virtual = "virtual" in str(text).lower().split()[1:2]
+            if is_virtual or kind != "table":
+                what = "a virtual table" if is_virtual else "a view"
+                raise self.error(table, what, "a table")
             break
         else:
             return ()

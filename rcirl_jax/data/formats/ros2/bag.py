@@ -153,7 +153,7 @@ def _of_mcap(path: Path, stream: BinaryIO) -> BagFile:
         )
     stream.seek(0)
     where, sound = str(path), "a sound MCAP file; `mcap doctor FILE` says what is wrong"
-    with _damaged(where, sound):
+    with damaged(where, sound):
         reader = extra_module("mcap.reader", EXTRA).SeekingReader(
             stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES
         )
@@ -185,7 +185,7 @@ def _of_mcap(path: Path, stream: BinaryIO) -> BagFile:
     def messages(wanted: Collection[str]) -> Iterator[Sent]:
         found = reader.iter_messages(topics=list(wanted))
         while True:
-            with _damaged(where, sound):
+            with damaged(where, sound):
                 item = next(found, None)
             if item is None:
                 return
@@ -281,13 +281,13 @@ def decoder_of(path: Path, name: str, topic: Topic) -> Callable[[bytes], Message
     )
     # the parser prints the line that it cannot read, which the error says as well
     quiet = contextlib.redirect_stderr(io.StringIO())
-    with _damaged(where, "a message definition of ROS 2"), quiet:
+    with damaged(where, "a message definition of ROS 2"), quiet:
         return decoders.DecoderFactory().decoder_for("cdr", schema)
 
 
 @contextlib.contextmanager
-def _damaged(where: str, expected: str) -> Iterator[None]:
-    """Turns whatever the libraries raise on bytes that they cannot read into one line.
+def damaged(where: str, expected: str) -> Iterator[None]:
+    """Turns whatever libraries raise on bytes that they cannot read into one line.
 
     They have no common error: struct, zstandard, lz4, the parser and mcap have theirs.
     """

@@ -24,6 +24,7 @@ from rcirl_jax.data.formats.ros2.bag import (
     Topic,
     as_sent,
     bags_of,
+    damaged,
     decoder_of,
     files_in,
     open_file,
@@ -152,21 +153,15 @@ class BagDrive(Drive):
                     decoders[name] = decoder_of(path, name, own[name])
                 self.context.where = f"{path}: {name}: message {numbers[name]}"
                 numbers[name] += 1
-                try:
+                with damaged(self.context.where, f"a {kind}"):
                     message = decoders[name](as_sent(data))
-                    found = [*TYPES[role][kind](message, self.context)]
-                except InputError:
-                    raise
-                except AttributeError as error:
-                    raise InputError(
-                        f"{self.context.where}: {error.name}: missing in the file's "
-                        f"definition: expected a {kind} with it"
-                    ) from error
-                except Exception as error:  # bytes that are cut short: struct's, others
-                    what = f"{type(error).__name__}: {str(error)[:200]}"
-                    raise InputError(
-                        f"{self.context.where}: {what}: expected a {kind}"
-                    ) from error
+                    try:
+                        found = [*TYPES[role][kind](message, self.context)]
+                    except AttributeError as error:
+                        raise InputError(
+                            f"{self.context.where}: {error.name}: missing in the "
+                            f"file's definition: expected a {kind} with it"
+                        ) from error
                 for row in found:
                     yield role, logged * 1e-9, share, row
 
