@@ -236,6 +236,7 @@ def row_name(reward: Reward) -> str:
         "logistic": "RC-IRL logistic",
         "listwise": "MaxEnt",
         "soft": "soft labels",
+        "risk": "least expected distance",
         "gan": "GAN",
     }
     loss = str(reward.loss.get("name"))

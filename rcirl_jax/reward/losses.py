@@ -17,7 +17,8 @@ from jaxtyping import Array, Bool, Float
 
 from rcirl_jax.types import CandidateInfo
 
-MARGIN_CEILING_M = 10.0  # m, distance at which the margin of the hinge saturates
+# m, at which hinge's margin and risk's charge saturate; what a collision is charged
+CEILING_M = 10.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -80,7 +81,7 @@ def task_margin(c: LossInputs, config: LossConfig) -> Float[Array, "b k"]:
 
     Source: Ratliff et al. (ICML 2006), with the task loss of Sadat et al. (2019).
     """
-    near = jnp.minimum(c.info.distance, MARGIN_CEILING_M)
+    near = jnp.minimum(c.info.distance, CEILING_M)
     return (
         config.margin_distance * near
         + config.margin_collision * c.info.collides
@@ -158,6 +159,24 @@ def _soft(c: LossInputs, config: LossConfig) -> tuple[jax.Array, jax.Array]:
     return _over_scenes(c, -jnp.sum(labels * log_p, axis=1))
 
 
+def _risk(c: LossInputs, config: LossConfig) -> tuple[jax.Array, jax.Array]:
+    """Expected distance to the human of a choice at random by exp(V), in m.
+
+        L = sum_i P_i d_i,   P = softmax(V),   d = min(distance, 10), 10 if it collides
+
+    A smooth form of the top-1 distance. It is bounded, so a term with heavy tails in
+    few scenes does not decide the weights of the others, as it does where log P counts.
+    Source: minimum risk training (Och, ACL 2003; Shen et al., ACL 2016).
+    """
+    del config
+    counted = _counted(c)
+    apart = jnp.minimum(_all(c.info.human_distance, c.info.distance), CEILING_M)
+    hit = _all(c.info.human_collides, c.info.collides)
+    values = jnp.where(counted, _all(c.human, c.candidates), -jnp.inf)
+    share = jax.nn.softmax(values, axis=1)
+    return _over_scenes(c, jnp.sum(share * jnp.where(hit, CEILING_M, apart), axis=1))
+
+
 def _gan(c: LossInputs, config: LossConfig) -> tuple[jax.Array, jax.Array]:
     """The paper's GAN baseline: a discriminator that never compares in a scene.
 
@@ -179,6 +198,7 @@ LOSSES: dict[str, Callable[[LossInputs, LossConfig], tuple[jax.Array, jax.Array]
     "hinge": _hinge,
     "listwise": _listwise,
     "soft": _soft,
+    "risk": _risk,
     "gan": _gan,
 }
 

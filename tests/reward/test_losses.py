@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rcirl_jax.reward import LOSSES, LossConfig, loss_sums
-from rcirl_jax.reward.losses import MARGIN_CEILING_M
+from rcirl_jax.reward.losses import CEILING_M
 from tests.reward.compared import compared
 
 CONFIG = LossConfig()
@@ -42,7 +42,7 @@ def pair_oracle(name, c, b, k):
         return y if y >= 0 else CONFIG.leaky_rate * y
     if name == "logistic":
         return np.log1p(np.exp(y))
-    margin = CONFIG.margin_distance * min(c.info.distance[b, k], MARGIN_CEILING_M)
+    margin = CONFIG.margin_distance * min(c.info.distance[b, k], CEILING_M)
     margin += CONFIG.margin_collision * c.info.collides[b, k]
     return max(0.0, y + margin + CONFIG.margin_rule * c.info.breaks_rule[b, k])
 
@@ -63,6 +63,11 @@ def scene_oracle(name, c, b, ks):
         label *= 1.0 - np.array([c.info.human_collides[b], *c.info.collides[b, ks]])
         label /= label.sum()
         return -np.sum(label * np.log(np.exp(values) / np.exp(values).sum()))
+    if name == "risk":
+        apart = np.array([c.info.human_distance[b], *c.info.distance[b, ks]])
+        hit = np.array([c.info.human_collides[b], *c.info.collides[b, ks]])
+        charge = np.where(hit > 0, 10.0, np.minimum(apart, 10.0))
+        return np.sum(np.exp(values) / np.exp(values).sum() * charge)
     real = -np.log(1 / (1 + np.exp(-(h + c.offset))))
     fake = [-np.log(1 - 1 / (1 + np.exp(-(v[k] + c.offset)))) for k in ks]
     return real + np.mean(fake)
