@@ -40,6 +40,7 @@ from rcirl_jax.export.closed_loop import (
 )
 from rcirl_jax.planner.program import processes_of
 from rcirl_jax.planner.safety import TRACKS
+from rcirl_jax.sampling.sampler import MODES
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
 from rcirl_jax.simulation.recorded import held_out
 from rcirl_jax.simulation.rows import BASELINES, human_row
@@ -70,6 +71,13 @@ _FILTER = flags.DEFINE_enum(
     "filter", "full", TRACKS, "full, or collision: the reward decides the rest"
 )
 _CHUNK = flags.DEFINE_integer("chunk", 180, "cases driven together; bounds memory")
+_MODE = flags.DEFINE_enum(
+    "mode",
+    None,
+    MODES,
+    "what baselines that rank candidates plan: speed along the given path, or path_speed; "
+    "default: what the first weights were trained for",
+)
 _EXECUTOR = shared.executor()
 _CASES = shared.suite("smoke")
 OF_DATA = ("recorded", "heldout")  # suites of --data
@@ -94,6 +102,7 @@ def main() -> None:
         tuned_idm=read_tuned_idm(Path(_IDM.value)) if _IDM.value else None,
         track=_FILTER.value,
         planners=tuple(("", command) for command in _PLANNERS.value),
+        mode=_MODE.value,
     )
     for command in _PLANNERS.value:
         checked_program(command)

@@ -64,6 +64,7 @@ from rcirl_jax.planner.own_cost import (
 from rcirl_jax.planner.program import Program, check_program, is_program, program
 from rcirl_jax.planner.rank import (
     ONLINE,
+    ONLINE_PATHS,
     Params,
     RankConfig,
     Ranking,
@@ -74,6 +75,7 @@ from rcirl_jax.planner.rank import (
     ranking_score,
 )
 from rcirl_jax.planner.safety import SafetyConfig
+from rcirl_jax.reward.speed_dp import SPEED_DP_ROW
 from rcirl_jax.reward import RewardConfig, fit_normaliser, init_params, seen_range
 from rcirl_jax.runtime.atomic_files import read_json, write_json
 from rcirl_jax.runtime.checked import checked
@@ -166,6 +168,7 @@ def table_rows(
     track: str = "full",
     own: str = "",
     planners: Sequence[tuple[str, str]] = (),
+    mode: str | None = None,
 ) -> list[Row]:
     """Learned rows first, in the order of the files, planners, then the baselines.
 
@@ -173,36 +176,51 @@ def table_rows(
     again by `dp`. A tuned IDM comes last. `track` is the safety filter's
     (`SafetyConfig`), `own` the place of the user's own cost, a baseline by its name.
     `planners` are names of rows ("" for a program's own) and `planner.program` places.
+    Weights plan what they were trained to plan, the other rows that rank candidates what
+    `mode` says, or else the first file's; the rest plan speed along the given path.
 
     Raises:
       InputError: no file and no planner, an unreadable one, one twice without `names`,
-        path_speed weights, an unknown baseline, a planner that cannot be started or is
-        called as another row.
+        an unknown baseline, a planner that cannot be started or is called as another
+        row.
     """
     if not weights and not planners:
         raise InputError("weights: none: expected at least one file or planner")
     rewards = [open_reward(path) for path in weights]
     user = own_cost_of(rewards, own)
-    sampler = own_sampler_of(rewards, ONLINE)
-    config = RankConfig(sampler=sampler, safety=SafetyConfig(track=track), own=user)
-    rows = _learned_rows(rewards, names, config)
+    configs = {
+        x: RankConfig(
+            sampler=own_sampler_of(rewards, grid),
+            safety=SafetyConfig(track=track, entry=x == "path_speed"),
+            own=user,
+        )
+        for x, grid in (("speed", ONLINE), ("path_speed", ONLINE_PATHS))
+    }
+    rows = _learned_rows(rewards, names, configs)
     first = rewards[0] if rewards else None
     preset, params, activation = _program_of(first)
+    config = configs[mode or (first.mode if first else "speed")]
     if dp and first is None:
         raise InputError("dp: without weights: expected a weights file")
+    if dp and first is not None and first.mode != "speed":
+        raise InputError(f"dp: {first.file}: mode: {first.mode}: expected speed")
     if dp and first is not None and first.prior_cost is not None:
         raise InputError(
             f"dp: {first.file}: expected a reward without a prior cost: the own cost "
             "is no sum over points"
         )
     if dp:
-        policy = dp_policy(feature_map(preset), activation, config, DpConfig())
+        policy = dp_policy(
+            feature_map(preset), activation, configs["speed"], DpConfig()
+        )
         every, name = max(plan_every, DP_EVERY), f"{rows[0].name} DP"
         row = Row(name=name, policy=policy, params=params, plan_every=every)
         rows.insert(1, row)
     rows += [program_row(program(place), name) for name, place in planners]
+    by_name = {SPEED_DP_ROW: configs["speed"]}  # a cost of speed alone
     rows += [
-        baseline_row(name, preset, params, config, activation) for name in baselines
+        baseline_row(name, preset, params, by_name.get(name, config), activation)
+        for name in baselines
     ]
     if tuned_idm is not None:
         rows.append(rule_row(TUNED_IDM_ROW, "IDM", Yielding(idm=tuned_idm)))
@@ -226,16 +244,12 @@ def _program_of(
 
 
 def _learned_rows(
-    rewards: Sequence[Reward], names: Sequence[str], config: RankConfig
+    rewards: Sequence[Reward], names: Sequence[str], configs: dict[str, RankConfig]
 ) -> list[Row]:
     """One row a file, under distinct names."""
     rows: list[Row] = []
     for reward, name in zip(rewards, names or row_names(rewards), strict=True):
-        mode = str(reward.provenance.get("mode", "speed"))
-        if mode != "speed":
-            raise InputError(
-                f"{reward.file}: mode: {mode}: the closed loop plans speed"
-            )
+        config = configs[reward.mode]
         seed = int(reward.provenance.get("seed") or 0)
         score, params = score_of(reward, config.own)
         policy = rank_policy(score, config)
@@ -261,6 +275,7 @@ class SuiteJob:
     planners: tuple[tuple[str, str], ...] = ()
     # a gate's candidate also at its highest gain everywhere, if its gain varies
     highest: bool = False
+    mode: str | None = None  # of rows without weights, as in `table_rows`
 
     def __post_init__(self) -> None:
         """Refuses plans that are never made."""
@@ -279,6 +294,7 @@ class SuiteJob:
             tuned_idm=self.tuned_idm,
             own=self.own,
             planners=self.planners,
+            mode=self.mode,
         )
         rows.sort(key=lambda row: row.name != CANDIDATE)
         first, params = rows[0], rows[0].params

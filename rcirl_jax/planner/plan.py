@@ -1,6 +1,6 @@
 """The plan that answers a scene, and how it is followed until the next one.
 
-A plan is s(t), v(t), a(t) on the time axis. Until the next planning step the ego
+A plan is s(t), v(t), a(t) on the time axis, with a path l(s) or on a given one. Until the next planning step the ego
 follows it (`command`), and that step has the rest of it among its candidates
 (`stations_from_now`), so that the trajectory that was valued is the one that is driven.
 
@@ -28,7 +28,7 @@ from rcirl_jax.geometry.frenet import lookup
 from rcirl_jax.geometry.polynomial import hermite
 from rcirl_jax.planner.safety import SafetyConfig, check
 from rcirl_jax.sampling import SamplerConfig, trajectory_on_path
-from rcirl_jax.sampling.kinematics import running_max
+from rcirl_jax.sampling.kinematics import running_max, trajectory_from_positions
 from rcirl_jax.sampling.sampler import family_index, within_limits
 from rcirl_jax.types import Candidates, Scene, Trajectory
 from rcirl_jax.units import DT_S, NUM_TIMES, TIMES_S
@@ -49,6 +49,9 @@ class Plan(flax.struct.PyTreeNode, kw_only=True):
     s: jax.Array  # [T] m, planned stations
     v: jax.Array  # [T] m/s
     a: jax.Array  # [T] m/s^2
+    # [3, T] offsets m and their derivatives dl 1 and ddl 1/m by station; None: the path
+    # is given
+    path: jax.Array | None
     since: jax.Array  # [] s since it was made
     since_choice: jax.Array  # [] s since it was last chosen, made or confirmed
     lasts: jax.Array  # [] bool: may be gone on with at the next planning step
@@ -64,12 +67,14 @@ def plan_of(
     urgent: jax.Array | bool = False,
     fallback: jax.Array | bool = False,
     admissible: jax.Array | int = 0,
+    steers: bool = False,
 ) -> Plan:
-    """A fresh plan along a trajectory [T]."""
+    """A fresh plan along a trajectory [T], of its path too if it `steers`."""
     return Plan(
         s=chosen.s,
         v=chosen.v,
         a=chosen.a,
+        path=jnp.stack([chosen.l, chosen.dl, chosen.ddl]) if steers else None,
         since=jnp.zeros(()),
         since_choice=jnp.zeros(()),
         lasts=jnp.asarray(lasts),
@@ -79,11 +84,11 @@ def plan_of(
     )
 
 
-def no_plan() -> Plan:
+def no_plan(steers: bool = False) -> Plan:
     """The empty plan that is in force before the first one."""
     zero = jnp.zeros((NUM_TIMES,))
     nothing = Trajectory(**dict.fromkeys(Trajectory.__dataclass_fields__, zero))
-    return plan_of(nothing)
+    return plan_of(nothing, steers=steers)
 
 
 def held(v: jax.Array, a: jax.Array) -> Plan:
@@ -137,16 +142,41 @@ def stations_from_now(plan: Plan) -> jax.Array:
     Cubic Hermite interpolation between the planned times; after the plan's end its
     last speed is kept.
     """
-    times = jnp.asarray(TIMES_S)
-    t = plan.since + jnp.append(times, 0.0)
-    place = jnp.clip(t / DT_S, 0.0, NUM_TIMES - 1.0)
-    low = jnp.minimum(place.astype(jnp.int32), NUM_TIMES - 2)
-    (s, s_next), (v, v_next) = jnp.moveaxis(
-        jnp.stack([plan.s, plan.v])[:, low[:, None] + np.arange(2)], 2, 1
-    )
-    inside = hermite(place - low, s, s_next, (v, v_next), DT_S)
+    t = plan.since + jnp.append(jnp.asarray(TIMES_S), 0.0)
+    inside = _between(plan.s, plan.v, t)
     stations = inside + jnp.maximum(t - TIMES_S[-1], 0.0) * plan.v[-1]
     return stations[:-1] - stations[-1]
+
+
+def path_at(plan: Plan, after: jax.Array | float) -> jax.Array:
+    """Offset m, dl and ddl 1/m [3, ...] of a plan's path some seconds [...] from now.
+
+    Offsets by cubic Hermite interpolation between the planned times, the rest linearly;
+    after the plan's end its last offset is kept.
+    """
+    t = jnp.clip(plan.since + after, 0.0, TIMES_S[-1])
+    low = jnp.minimum((t / DT_S).astype(jnp.int32), NUM_TIMES - 2)
+    start, end = jnp.moveaxis(plan.path[:, low[..., None] + np.arange(2)], -1, 0)
+    linear = start + (t / DT_S - low) * (end - start)
+    l, dl, _ = plan.path
+    return linear.at[0].set(_between(l, dl * plan.v, t))
+
+
+def beside(plan: Plan, aside: jax.Array) -> Plan:
+    """The same plan in a frame whose reference line lies `aside` [] m to the left."""
+    if plan.path is None:
+        return plan
+    return plan.replace(path=plan.path.at[0].add(-aside))
+
+
+def _between(x: jax.Array, rate: jax.Array, t: jax.Array) -> jax.Array:
+    """Values [...] at times t [...] s of x [T] with its rate [T] per s."""
+    place = jnp.clip(t / DT_S, 0.0, NUM_TIMES - 1.0)
+    low = jnp.minimum(place.astype(jnp.int32), NUM_TIMES - 2)
+    (start, end), rates = jnp.moveaxis(
+        jnp.stack([x, rate])[:, low[..., None] + np.arange(2)], -1, 1
+    )
+    return hermite(place - low, start, end, tuple(rates), DT_S)
 
 
 Tree = Any
@@ -212,7 +242,11 @@ def either(yes: jax.Array | bool, one: Tree, other: Tree) -> Tree:
 def rest_of(scene: Scene, before: Plan, config: SamplerConfig) -> Candidates:
     """The rest of the plan in force as a candidate [1]; infeasible if there is none."""
     stations = running_max(scene.ego.s + stations_from_now(before))
-    rest = trajectory_on_path(scene, stations)
+    if before.path is None:
+        rest = trajectory_on_path(scene, stations)
+    else:
+        offsets = path_at(before, jnp.asarray(TIMES_S))[0].at[0].set(scene.ego.l)
+        rest = trajectory_from_positions(scene, stations, offsets)
     return Candidates(
         trajectory=jax.tree.map(lambda x: x[None], rest),
         feasible=(before.lasts & within_limits(scene, rest, config))[None],
@@ -227,6 +261,8 @@ def committed(
     commitment: float,
 ) -> Callable[..., Plan]:
     """A policy that keeps the plan in force while it may, and else plans by `replan`.
+
+    It `steers` if its sampler varies paths: its plans then have one.
 
     Args:
       replan: `(params, scene, key, in_force) -> Plan`; `in_force` None at first.
@@ -246,4 +282,5 @@ def committed(
         due = ~fine | (before.since_choice >= commitment)
         return only_where(due, replan, before, params, scene, key, (before, rest))
 
+    policy.steers = sampler.mode == "path_speed"
     return policy

@@ -65,6 +65,15 @@ ONLINE = SamplerConfig(
     stop_brakings=(0.8, 1.5, 2.5),
     num_random=8,
 )
+# The same speeds in the middle of the lane, every fifth with other paths: 168 candidates.
+ONLINE_PATHS = dataclasses.replace(
+    ONLINE,
+    mode="path_speed",
+    lateral_times=(4.0, 7.0),
+    nudge_offsets=(-0.5, 0.5),
+    lateral_always=(1,),
+    lateral_stride=5,
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -77,6 +86,11 @@ class RankConfig:
     commitment: float = 1.0
     # the user's own cost, by which rows of its name drive
     own: OwnCost | None = None
+
+    @property
+    def steers(self) -> bool:
+        """True if paths are planned."""
+        return self.sampler.mode == "path_speed"
 
 
 def value_rows(
@@ -278,6 +292,7 @@ def best_plan(
         urgent=urgent,
         fallback=fallback,
         admissible=count,
+        steers=config.steers,
     )
     if in_force is None:
         return fresh

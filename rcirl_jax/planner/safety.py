@@ -8,7 +8,9 @@ It is the same for learned, hand-set and random scores. For each candidate:
 3. hard limits: the speed limit handed to the planner, the road's edges for the
    box's sides, and lateral acceleration;
 4. a distance from which braking still avoids the leader (RSS, Shalev-Shwartz
-   et al. 2017), or at least a growing margin where another car took it away.
+   et al. 2017), or at least a growing margin where another car took it away;
+5. where paths are planned, the same distance to whom the ego moves in behind, and one
+   from which whoever it moves in ahead of can brake gently.
 
 `check` tells which candidates keep all rules, `explain` which rule each breaks first.
 Numbers of an obstacle at times when it is not there are never read.
@@ -85,6 +87,11 @@ class SafetyConfig:
     rss_index: int = 2
     # m by which a violated distance must have grown by then
     rss_recovery: float = 0.3
+    # whether bodies that the ego itself moves in ahead of or behind keep a gap (rule 5)
+    entry: bool = False
+    # s and m/s^2, reaction and braking of who is behind then
+    rear_reaction: float = 0.6
+    rear_braking: float = 3.0
 
     def __post_init__(self) -> None:
         """Reject an unknown track."""
@@ -112,6 +119,7 @@ class Reason(enum.IntEnum):
     ROAD = 5  # a side of the box leaves the road
     BEND = 6  # lateral acceleration
     DISTANCE = 7  # too near behind a leader
+    ENTRY = 8  # moves in too near ahead of a body or behind one
 
 
 class Explanation(NamedTuple):
@@ -163,6 +171,9 @@ def check(
         slow, on_road, gentle = _inside_limits(scene, x, config)
         inside = xp.all(slow & on_road & gentle, axis=0)
         admissible = admissible & inside & xp.all(keeps, axis=0)
+        if config.entry:
+            for crowded in _crowds(scene, x, config):
+                admissible = admissible & ~xp.any(crowded, axis=0)
     return Verdict(
         admissible=admissible,
         contact_s=body,
@@ -202,6 +213,9 @@ def explain(
         margin, keeps = _rss(scene, x, config)
         nearest = xp.argmin(xp.where(keeps, xp.inf, margin), axis=0)
         rules.append((xp.any(~keeps, axis=0), nearest, None))
+        if config.entry:
+            crowded = xp.stack(list(_crowds(scene, x, config)))  # [N, T - 1, K]
+            rules.append(_first_of(xp.where(crowded, TIMES_S[1:, None], xp.inf)))
     count = x.s.shape[1]
     reason = xp.zeros(count, "int32")
     obstacle, time = xp.full(count, -1, "int32"), xp.full(count, xp.inf, "float32")
@@ -333,11 +347,57 @@ def _crossings(scene: Scene, x: Motion, config: SafetyConfig) -> Array:
     return is_line & (front > wall - slack)
 
 
-def _rss(scene: Scene, x: Motion, config: SafetyConfig) -> tuple[Array, Array]:
-    """Margin [N, K] m to the RSS distance soon, and whether it is kept or grows.
+def _rss_distance(v: Array, lead: Array, config: SafetyConfig) -> Array:
+    """Distance m to keep at speed v m/s behind a leader of some speed m/s.
 
     d = v rho + v^2 / (2 b_ego) - v_lead^2 / (2 b_lead) + standstill
     """
+    xp = namespace(v, lead)
+    lead = xp.maximum(lead, 0.0)
+    needed = (
+        v * config.reaction
+        + v**2 / (2.0 * config.ego_braking)
+        - lead**2 / (2.0 * config.leader_braking)
+    )
+    return xp.maximum(needed, 0.0) + config.standstill
+
+
+def _crowds(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
+    """For each obstacle, when [T - 1, K] the ego enters its corridor too near to it.
+
+    The ego enters where its box comes beside or before one that it would be clear of at
+    its offset of t = 0; whoever changes lane towards it is not its doing. Then
+
+        ahead:   gap >= d of `_rss_distance`
+        behind:  gap >= v_r rho_r + max(v_r^2 - v^2, 0) / (2 b_r) + standstill
+    """
+    obstacles, ego = scene.obstacles, scene.ego
+    xp = namespace(x.s, obstacles.s_lower)
+    reach = 0.5 * ego.width + config.margin_across
+    for n in range(obstacles.kind.shape[0]):
+        body = (obstacles.kind[n] >= Kind.VEHICLE) & (obstacles.kind[n] <= Kind.STATIC)
+        low_s, high_s, low_l, high_l, speed, valid = (
+            getattr(obstacles, name)[n][:, None]
+            for name in ("s_lower", "s_upper", "l_lower", "l_upper", "speed", "valid")
+        )
+        aside = lambda l, low=low_l, high=high_l: xp.maximum(low - l, l - high)  # noqa: E731
+        is_in = (aside(x.l) < reach) & (aside(x.l[:1]) >= reach) & valid & body
+        enters = is_in[1:] & ~is_in[:-1]
+        ahead = 0.5 * (low_s + high_s) > x.s
+        before = low_s - x.s - 0.5 * ego.length
+        after = x.s - 0.5 * ego.length - high_s
+        brakes = xp.maximum(speed**2 - x.v**2, 0.0) / (2.0 * config.rear_braking)
+        behind = xp.maximum(speed, 0.0) * config.rear_reaction + brakes
+        near = xp.where(
+            ahead,
+            before < _rss_distance(x.v, speed, config),
+            after < xp.where(speed > 0.0, behind, 0.0) + config.standstill,
+        )
+        yield enters & near[1:]
+
+
+def _rss(scene: Scene, x: Motion, config: SafetyConfig) -> tuple[Array, Array]:
+    """Margin [N, K] m to the RSS distance soon, and whether it is kept or grows."""
     obstacles, ego = scene.obstacles, scene.ego
     xp = namespace(x.s, obstacles.s_lower)
     body = (obstacles.kind >= Kind.VEHICLE) & (obstacles.kind <= Kind.STATIC)
@@ -352,13 +412,7 @@ def _rss(scene: Scene, x: Motion, config: SafetyConfig) -> tuple[Array, Array]:
         )
         gap = s_lower - x.s[i] - 0.5 * ego.length
         aside = xp.maximum(l_lower - x.l[i], x.l[i] - l_upper)
-        lead = xp.maximum(speed, 0.0)
-        needed = (
-            x.v[i] * config.reaction
-            + x.v[i] ** 2 / (2.0 * config.ego_braking)
-            - lead**2 / (2.0 * config.leader_braking)
-        )
-        needed = xp.maximum(needed, 0.0) + config.standstill
+        needed = _rss_distance(x.v[i], speed, config)
         in_way = aside < 0.5 * ego.width + config.margin_across
         ahead = s_upper > x.s[i]
         leads = in_way & ahead & (body & along & obstacles.valid[:, i])[:, None]

@@ -95,6 +95,8 @@ class SamplerConfig:
     min_lateral_length: float = 15.0
     # m, offsets of nudges from the lateral position at t = 0
     nudge_offsets: tuple[float, ...] = (-0.8, -0.4, 0.4, 0.8)
+    # lateral profiles with which every speed profile is paired; 0: hold, 1: centre
+    lateral_always: tuple[int, ...] = (0, 1)
     # every n-th speed profile is paired with each further lateral profile
     lateral_stride: int = 4
     # m/s^2, feasible accelerations (Apollo: -6 to 4)
@@ -183,14 +185,14 @@ def _speed_families(config: SamplerConfig) -> np.ndarray:
 def _pairs(config: SamplerConfig) -> tuple[np.ndarray, np.ndarray]:
     """(speed profile, lateral profile) of every `path_speed` candidate.
 
-    Every speed profile is driven holding the offset and towards the lane's
-    centre; every `lateral_stride`-th with each further lateral profile.
+    Every speed profile is driven with `lateral_always`, holding the offset and towards
+    the lane's centre; every `lateral_stride`-th with each further lateral profile.
     """
     num_speed = _speed_families(config).size
     every_profile = np.arange(num_speed)
     strided = every_profile[:: config.lateral_stride]
-    pairs = [(i, m) for m in (0, 1) for i in every_profile]
-    rest = range(2, num_lateral(config))
+    pairs = [(i, m) for m in config.lateral_always for i in every_profile]
+    rest = [m for m in range(num_lateral(config)) if m not in config.lateral_always]
     pairs += [(i, m) for m in rest for i in strided]
     grid = np.array(pairs, np.int32)
     return grid[:, 0], grid[:, 1]
@@ -213,7 +215,8 @@ def sample(key: jax.Array, scene: Scene, config: SamplerConfig) -> Candidates:
 
     Returns:
       Candidates with K = `num_candidates(config)`. Infeasible ones stay in
-      place and are masked; emergency stops count as feasible always.
+      place and are masked; emergency stops count as feasible always, where paths vary
+      those that keep the offset or the lane.
     """
     with jax.named_scope("sampling"):
         stations = speed_profiles(key, scene, config)
@@ -241,6 +244,9 @@ def sample(key: jax.Array, scene: Scene, config: SamplerConfig) -> Candidates:
             allowed = allowed[which_lateral] > 0.0
         inside = jax.vmap(lambda x: within_limits(scene, x, config))(trajectory)
         is_emergency = family == family_index("emergency")
+        if config.mode != "speed" and not config.own:
+            # the others swerve as hard as they brake
+            is_emergency = is_emergency & (which_lateral < 2)
         if config.own:
             allowed = _begins(scene, stations, config) | is_emergency
         return Candidates(

@@ -57,6 +57,9 @@ class Road(flax.struct.PyTreeNode, kw_only=True):
     lanes_right: jax.Array  # [] int32, same-direction lanes right of lane 0
     edge_left: jax.Array  # [] m, l of the drivable area's left edge
     edge_right: jax.Array  # [] m, l of its right edge (negative)
+    # [R] m, edges of the lanes that the route leaves free; read where paths are planned
+    route_left: jax.Array
+    route_right: jax.Array
     destination: jax.Array  # [] m, station where the route ends
 
 
@@ -282,6 +285,7 @@ class Snapshot(flax.struct.PyTreeNode, kw_only=True):
     agents: AgentState
     plan_s: jax.Array  # [T] m, absolute planned stations
     line_red: jax.Array  # [L] bool: the line demands a stop now
+    plan_l: jax.Array | None = None  # [T] m, planned offsets; None: the given path's
 
 
 # fields of `Driver` that are numbers, and the flags of an agent

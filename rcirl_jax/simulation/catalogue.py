@@ -202,6 +202,7 @@ def _add_elements(family: Family, variables: dict[str, float], parts: Parts) -> 
         parts.kappa += f["kappa"] * np.clip(rise, 0.0, 1.0)
     parts.limits += [(f["at"], f["speed"]) for _, f in values["limit"]]
     parts.shifts += [(f["at"], f["length"], f["l"]) for _, f in values["shift"]]
+    parts.routes += [tuple(f.values()) for _, f in values["route"]]
     for element, f in values["line"]:
         kind = LineKind.LIGHT if element.kind == "light" else LineKind.STOP_SIGN
         parts.lines.append({**f, "s": f["at"], "kind": kind})
@@ -246,7 +247,9 @@ def _events(
     seed: int,
 ) -> Parts:
     """Play through the events along the road."""
-    parts = Parts(kappa=np.zeros(NUM_ROAD), limits=[], shifts=[], lines=[], agents=[])
+    parts = Parts(
+        kappa=np.zeros(NUM_ROAD), limits=[], shifts=[], routes=[], lines=[], agents=[]
+    )
     members = {}
     for event in range(int(road["events"])):
         source, own = family, draws.event(event)

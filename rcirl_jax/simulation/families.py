@@ -39,6 +39,7 @@ class Parts:
     kappa: np.ndarray
     limits: list[tuple[float, float]]
     shifts: list[tuple[float, float, float]]
+    routes: list[tuple[float, float, float, float]]  # m, m, first and last lane
     lines: list[dict[str, float]]
     agents: list[dict]
 
@@ -68,8 +69,40 @@ def road_of(road: dict[str, float], parts: Parts) -> Road:
             (road["lanes_left"] + road["oncoming"] + 0.5) * width + road["shoulder"]
         ),
         edge_right=f(-((road["lanes_right"] + 0.5) * width + road["shoulder"])),
+        **_route(road, path, parts.routes),
         destination=f(road["destination"]),
     )
+
+
+ON_LANE = 0.02  # 1, of a lane's width: nearer to its middle a path is on that lane alone
+
+
+def _route(
+    road: dict[str, float], path: np.ndarray, routes: list[tuple[float, ...]]
+) -> dict[str, np.ndarray]:
+    """Edges [R] m of the lanes that the route leaves free, fields of `Road`.
+
+    Free are the lanes that the given path is on, both while it goes from one to another,
+    and those that a [[route]] opens. The outermost lanes come with their shoulder.
+
+    Args:
+      road: its numbers.
+      path: [R] m, offset of the given path.
+      routes: station, length, first and last lane of each opening.
+    """
+    width, shoulder = road["lane_width"], road["shoulder"]
+    ends = -road["lanes_right"], road["lanes_left"] + road["oncoming"]
+    low = np.floor(path / width + ON_LANE)
+    high = np.ceil(path / width - ON_LANE)
+    for at, length, first, last in routes:
+        inside = (at <= STATIONS) & (at + length >= STATIONS)
+        low = np.where(inside, np.minimum(low, first), low)
+        high = np.where(inside, np.maximum(high, last), high)
+    low, high = np.clip(low, *ends), np.clip(high, *ends)
+    right = (low - 0.5) * width - shoulder * (low <= ends[0])
+    left = (high + 0.5) * width + shoulder * (high >= ends[1])
+    edges = {"route_left": left, "route_right": right}
+    return {name: edge.astype(np.float32) for name, edge in edges.items()}
 
 
 MAX_LENGTH = 400  # characters of an expression
@@ -225,6 +258,7 @@ ELEMENTS: dict[str, dict[str, float | str | None]] = {
     "curve": {"at": None, "length": None, "kappa": None, "ramp": 20.0},
     "limit": {"at": None, "speed": None},
     "shift": {"at": None, "length": None, "l": None},
+    "route": {"at": None, "length": "inf", "low": None, "high": None},
     "line": {"at": None, "green": 20.0, "yellow": 3.0, "red": 20.0, "offset": 0.0},
 }
 AGENT = {
@@ -260,6 +294,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     curve: list[dict] = []
     limit: list[dict] = []
     shift: list[dict] = []
+    route: list[dict] = []
     line: list[dict] = []
     agent: list[dict] = []
     perception: dict[str, Any] = {}
@@ -308,7 +343,7 @@ class Parameter:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Element:
-    """A curve, limit, shift or line: expressions by field."""
+    """A curve, limit, shift, route or line: expressions by field."""
 
     kind: str  # for a line "light" or "stop_sign", else ""
     when: Expression | None

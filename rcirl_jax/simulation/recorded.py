@@ -347,6 +347,9 @@ def _road(one: Demonstration) -> Road:
     human_l = np.asarray(one.human.l)
     edge_left = max(np.asarray(path.road_left)[driven].max(), human_l.max() + reach)
     edge_right = min(np.asarray(path.road_right)[driven].min(), human_l.min() - reach)
+    # where the human was there is road, whatever the map says
+    along = np.arange(NUM_ROAD) * ROAD_STEP_M
+    beside = np.interp(along, one.human.s, human_l).astype(single)
     o = one.scene.obstacles
     ends = np.asarray(o.valid)[:, 0] & (np.asarray(o.kind) == Kind.VIRTUAL)
     destination = (NUM_ROAD - 1) * ROAD_STEP_M
@@ -362,5 +365,7 @@ def _road(one: Demonstration) -> Road:
         lanes_right=np.int32(max((right - edge_right + 0.5) // width, 0)),
         edge_left=single(edge_left),
         edge_right=single(edge_right),
+        route_left=np.maximum(prolonged(path.road_left), beside + reach),
+        route_right=np.minimum(prolonged(path.road_right), beside - reach),
         destination=single(destination),
     )

@@ -2,8 +2,9 @@
 
 The only file of the simulator that names `jit`, `vmap` or `scan` over cases and time.
 A policy is a pure function `(params, scene, key, before) -> Plan`, `before` being the
-plan in force; between two plans the ego follows the plan. One with a method `in_case`
-is given number and step of the case besides.
+plan in force; between two plans the ego follows the plan, along the given path unless
+the policy `steers`. One with a method `in_case` is given number and step of the case
+besides.
 
 What is compiled is a span of half a second for a group of cases. Longer drives are the
 same program called again, so that one serves the suite, held-out drives, demonstrations
@@ -28,7 +29,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.planner.plan import Plan, command, later, no_plan, stations_from_now
+from rcirl_jax.planner.plan import (
+    Plan,
+    beside,
+    command,
+    later,
+    no_plan,
+    path_at,
+    stations_from_now,
+)
 from rcirl_jax.simulation.agents import colours
 from rcirl_jax.simulation.cases import (
     STEP_S,
@@ -38,8 +47,17 @@ from rcirl_jax.simulation.cases import (
     World,
     nobody_recorded,
 )
-from rcirl_jax.simulation.world import Vehicle, observe, road_limit, start, step
+from rcirl_jax.simulation.world import (
+    Vehicle,
+    lane_centre,
+    observe,
+    road_limit,
+    start,
+    steering_lead,
+    step,
+)
 from rcirl_jax.types import Scene
+from rcirl_jax.units import TIMES_S
 
 Params = Any  # a policy's weights: any pytree
 Policy = Callable[..., Plan]  # (params, scene, key, plan in force) -> Plan
@@ -121,34 +139,42 @@ class Now(flax.struct.PyTreeNode, kw_only=True):
 
     worlds: World  # leaves [B, ...]
     waiting: jax.Array  # [B, MAX_DELAY + 1] m/s^2, commands, newest first
-    plan: Plan  # in force, leaves [B, ...]
+    plan: Plan  # in force, leaves [B, ...], offsets from the road's reference line
 
 
-@jax.jit
-def _begin(cases: Case) -> tuple[Now, jax.Array]:
+def _steers(policy: Policy) -> bool:
+    """True if a policy plans paths."""
+    return getattr(policy, "steers", False)
+
+
+@functools.partial(jax.jit, static_argnames="steers")
+def _begin(cases: Case, steers: bool = False) -> tuple[Now, jax.Array]:
     """The start of cases [B], and the speed limits [B, R] m/s that the planner gets."""
     count = cases.steps.shape[0]
     now = Now(
         worlds=jax.vmap(start)(cases),
         waiting=jnp.zeros((count, MAX_DELAY + 1)),
-        plan=jax.tree.map(lambda x: jnp.stack([x] * count), no_plan()),
+        plan=jax.tree.map(lambda x: jnp.stack([x] * count), no_plan(steers)),
     )
     # numbers of Python are of a weaker type, and would compile the first span alone
     now = jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), now)
-    return now, jax.vmap(lambda case: road_limit(case.road))(cases)
+    return now, jax.vmap(lambda case: road_limit(case.road, steers))(cases)
 
 
-@jax.jit
-def _seen(cases: Case, worlds: World, limits: jax.Array) -> Scene:
+@functools.partial(jax.jit, static_argnames="steers")
+def _seen(
+    cases: Case, worlds: World, limits: jax.Array, steers: bool = False
+) -> Scene:
     """The planning frames [B] of worlds [B]."""
-    return jax.vmap(observe)(cases, worlds, limits)
+    see = functools.partial(observe, steers=steers)
+    return jax.vmap(see)(cases, worlds, limits)
 
 
-def first_scenes(cases: Case) -> Scene:
-    """The first planning frame of each case [B]."""
+def first_scenes(cases: Case, steers: bool = False) -> Scene:
+    """The first planning frame of each case [B], of a planner that `steers` or not."""
     cases = _completed(cases)
-    now, limits = _begin(cases)
-    return _seen(cases, now.worlds, limits)
+    now, limits = _begin(cases, steers)
+    return _seen(cases, now.worlds, limits, steers)
 
 
 def _completed(cases: Case) -> Case:
@@ -167,14 +193,17 @@ def _completed(cases: Case) -> Case:
 @functools.lru_cache(maxsize=32)
 def _compiled(policy: Policy, plan_every: int, length: int, vehicle: Vehicle) -> Any:  # noqa: ANN401
     """The program of a span of `length` steps."""
+    steers = _steers(policy)
+    lead = np.array([0.0, steering_lead(vehicle)])
 
     def tick(case: Case, manner: Manner, now: Now) -> tuple[Now, jax.Array]:
         world, plan = now.worlds, now.plan
         waiting = jnp.append(command(plan, world.ego.v), now.waiting[:-1])
         late = waiting[manner.command_delay]
         applied = jnp.maximum(late, world.ego.a - manner.below)
+        planned = path_at(plan, lead) if steers else None
         after, record = step(
-            case, world, applied, plan.fallback, vehicle, manner.follow_log
+            case, world, applied, plan.fallback, vehicle, manner.follow_log, planned
         )
         shot = _snapshot(case, world, after, plan)
         plan = later(plan, STEP_S)
@@ -196,10 +225,16 @@ def _compiled(policy: Policy, plan_every: int, length: int, vehicle: Vehicle) ->
                 return policy(params, scene, key, before)
 
         def plan_and_drive(now: Now, _: None) -> tuple[Now, jax.Array]:
-            scenes = jax.vmap(observe)(cases, now.worlds, limits)
-            now = now.replace(
-                plan=jax.vmap(plan_of)(scenes, keys, now.worlds, now.plan, cases.seed)
-            )
+            see = functools.partial(observe, steers=steers)
+            scenes = jax.vmap(see)(cases, now.worlds, limits)
+            plans = now.plan
+            if steers:  # a scene's offsets are from the middle of the ego's lane
+                middle = jax.vmap(lane_centre)(cases.road, now.worlds.ego.l)
+                plans = jax.vmap(beside)(plans, middle)
+            plans = jax.vmap(plan_of)(scenes, keys, now.worlds, plans, cases.seed)
+            if steers:
+                plans = jax.vmap(beside)(plans, -middle)
+            now = now.replace(plan=plans)
             drive = jax.vmap(tick, in_axes=(0, None, 0))
             return jax.lax.scan(
                 lambda now, _: drive(cases, manner, now), now, length=plan_every
@@ -237,7 +272,10 @@ def rollout(
         for policy, params in drivers
     ]
     manner = config.manner()
-    now, limits = _begin(cases)
+    steers = _steers(drivers[0][0])
+    if any(_steers(policy) != steers for policy, _ in drivers):
+        raise InputError("takeover: one plans paths: expected both or neither to")
+    now, limits = _begin(cases, steers)
     logs, frames = [], []
     first, second = config.takeover_schedule
     if len(programs) > 1 and (first % length or second % length):
@@ -247,7 +285,7 @@ def rollout(
         )
     for at in range(0, config.steps, length):
         if config.frames_every and at % config.frames_every == 0:
-            frames.append(_seen(cases, now.worlds, limits))
+            frames.append(_seen(cases, now.worlds, limits, steers))
         others = len(programs) > 1 and at % (first + second) >= first
         program, params = programs[int(others)]
         now, made = program(params, cases, manner, limits, now)
@@ -302,6 +340,7 @@ def _snapshot(case: Case, now: World, after: World, plan: Plan) -> Snapshot:
         agents=after.agents,
         plan_s=now.ego.s + stations_from_now(plan),
         line_red=red | sign,
+        plan_l=None if plan.path is None else path_at(plan, jnp.asarray(TIMES_S))[0],
     )
 
 
@@ -311,11 +350,15 @@ def _packed(logs: tuple[Record, Snapshot]) -> jax.Array:
     return jnp.concatenate(leaves)
 
 
-def _unpacked(packed: Any, cases: Case) -> tuple[Record, Snapshot]:  # noqa: ANN401
+def _unpacked(
+    packed: Any,  # noqa: ANN401
+    cases: Case,
+    steers: bool,
+) -> tuple[Record, Snapshot]:
     """Records and snapshots [...] of packed ones [..., L]; numpy's or JAX's."""
     given, case = jax.tree.flatten(cases)
     kinds = tuple(jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in given)
-    leaves, tree = _layout(case, kinds)
+    leaves, tree = _layout(case, kinds, steers)
     ends = np.cumsum([leaf.size for leaf in leaves])
     parts = [
         packed[..., end - leaf.size : end]
@@ -327,23 +370,25 @@ def _unpacked(packed: Any, cases: Case) -> tuple[Record, Snapshot]:  # noqa: ANN
 
 
 @functools.lru_cache(maxsize=8)
-def _layout(case: Any, kinds: tuple) -> tuple[list, Any]:  # noqa: ANN401
+def _layout(case: Any, kinds: tuple, steers: bool) -> tuple[list, Any]:  # noqa: ANN401
     """Returns what `_packed` packs of a case of such leaves: leaves, their tree."""
 
     def logged(case: Case) -> tuple[Record, Snapshot]:
         world = start(case)
         after, record = step(case, world, case.ego_v, case.ego_v > 0.0, Vehicle())
-        return record, _snapshot(case, world, after, no_plan())
+        return record, _snapshot(case, world, after, no_plan(steers))
 
     return jax.tree.flatten(jax.eval_shape(logged, jax.tree.unflatten(case, kinds)))
 
 
 @functools.lru_cache(maxsize=8)
-def _reducer(reduce: Callable[[Record], Logs], steps: int) -> Callable:
+def _reducer(
+    reduce: Callable[[Record], Logs], steps: int, steers: bool
+) -> Callable:
     """A program of its own: whoever drove, records are judged by the same."""
 
     def judge(spans: list[jax.Array], cases: Case) -> Logs:
-        record, _ = _unpacked(jnp.concatenate(spans)[:steps], cases)
+        record, _ = _unpacked(jnp.concatenate(spans)[:steps], cases, steers)
         return jax.vmap(reduce, in_axes=1)(record)
 
     return jax.jit(judge)
@@ -386,18 +431,19 @@ def drive_cases(
     total = cases.steps.shape[0]
     in_groups = total % LANES == 0 and jax.default_backend() == "cpu"
     drivers = [(policy, params), *([takeover] if takeover else [])]
+    steers = _steers(policy)
 
     def group(first: int) -> Logs:
         lanes = slice(first, first + (LANES if in_groups else total))
         part = jax.tree.map(lambda leaf: leaf[lanes], cases)
         spans, frames = jax.block_until_ready(rollout(drivers, part, config))
-        made = reduce and _reducer(reduce, config.steps)(spans, part)
+        made = reduce and _reducer(reduce, config.steps, steers)(spans, part)
         if reduce and not keep:
             return jax.block_until_ready(made)
         packed = np.concatenate([np.asarray(x) for x in spans])[: config.steps]
         kept = (
             # time comes first: a view
-            *_unpacked(np.swapaxes(packed, 0, 1), part),
+            *_unpacked(np.swapaxes(packed, 0, 1), part, steers),
             jax.tree.map(lambda *x: np.stack(x, axis=1), *frames) if frames else None,
         )
         return (made, kept) if keep else kept

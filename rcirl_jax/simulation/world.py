@@ -125,16 +125,34 @@ def path_points(
     return here, slope, curvature, kappas[1]
 
 
-def steering(ego: EgoState, road: Road, vehicle: Vehicle) -> jax.Array:
+def steering_lead(vehicle: Vehicle) -> float:
+    """Time [s] by which curvature commands lead the path: the lag, half a step."""
+    return vehicle.steering_lag + 0.5 * STEP_S
+
+
+def steering(
+    ego: EgoState, road: Road, vehicle: Vehicle, planned: jax.Array | None = None
+) -> jax.Array:
     """Curvature command 1/m that leads the ego onto its path.
 
         c = c_path(s + v tau) - (l - l_path) / D^2 - 2 z (h - h_path) / D
 
     so that the lateral error e obeys e'' + 2 z e' / D + e / D^2 = 0 by station.
+
+    Args:
+      ego: its state.
+      road: with the given path.
+      vehicle: limits, lags and gains.
+      planned: [3, 2] l m, dl and ddl 1/m of a planned path, now and `steering_lead`
+        later; None: the given path is followed.
     """
-    ahead = ego.s + ego.v * (vehicle.steering_lag + 0.5 * STEP_S)
+    ahead = ego.s + ego.v * steering_lead(vehicle)
     l, slopes, curvatures, kappas = path_points(road, jnp.stack([ahead, ego.s]))
     feedforward, l_path, slope = curvatures[0], l[1], slopes[1]
+    if planned is not None:
+        (l_path, l), (slope, dl), (_, ddl) = planned
+        turn = _at(road.kappa, ahead + ROAD_STEP_M) - _at(road.kappa, ahead)
+        feedforward = path_curvature(kappas[0], turn / ROAD_STEP_M, l, dl, ddl)
     reach = jnp.maximum(vehicle.tracking_time * ego.v, vehicle.tracking_min_length)
     shrink = jnp.maximum(1.0 - kappas[1] * ego.l, 0.1)
     off_heading = ego.heading - jnp.arctan(slope / shrink)
@@ -147,14 +165,21 @@ def steering(ego: EgoState, road: Road, vehicle: Vehicle) -> jax.Array:
 
 
 def drive(
-    ego: EgoState, road: Road, acceleration: jax.Array, vehicle: Vehicle
+    ego: EgoState,
+    road: Road,
+    acceleration: jax.Array,
+    vehicle: Vehicle,
+    planned: jax.Array | None = None,
 ) -> EgoState:
-    """The ego one simulator step (0.1 s) later, under an acceleration command."""
+    """The ego one simulator step (0.1 s) later, under an acceleration command.
+
+    It follows the given path, or a planned one (as in `steering`).
+    """
     command = jnp.clip(acceleration, vehicle.min_acceleration, vehicle.max_acceleration)
     h = STEP_S / vehicle.substeps
     take_a = 1.0 - math.exp(-h / vehicle.acceleration_lag)
     take_c = 1.0 - math.exp(-h / vehicle.steering_lag)
-    target = steering(ego, road, vehicle)
+    target = steering(ego, road, vehicle, planned)
 
     def substep(_: int, ego: EgoState) -> EgoState:
         a = ego.a + take_a * (command - ego.a)
@@ -315,9 +340,19 @@ def is_vru(case: Case) -> jax.Array:
     return (kind == Kind.PEDESTRIAN) | (kind == Kind.CYCLIST)
 
 
-def road_limit(road: Road) -> jax.Array:
-    """Speed limit [R] m/s of a road as the planner gets it (`geometry.limits`)."""
-    return planning_limit(road.kappa, road.path_l, road.speed_limit, ROAD_STEP_M, jnp)
+def road_limit(road: Road, steers: bool = False) -> jax.Array:
+    """Speed limit [R] m/s of a road as the planner gets it (`geometry.limits`).
+
+    The bends of the given path count unless the planner `steers`.
+    """
+    path_l = jnp.zeros_like(road.path_l) if steers else road.path_l
+    return planning_limit(road.kappa, path_l, road.speed_limit, ROAD_STEP_M, jnp)
+
+
+def lane_centre(road: Road, l: jax.Array) -> jax.Array:
+    """Centre [] m of the lane at an offset [] m, among those of the ego's direction."""
+    lane = jnp.clip(jnp.round(l / road.lane_width), -road.lanes_right, road.lanes_left)
+    return road.lane_width * lane
 
 
 SEEN = ("s", "l", "heading", "v", "a", "present")  # rows of `World.seen`
@@ -373,28 +408,49 @@ def _window(table: jax.Array, s: jax.Array) -> jax.Array:
     return part[:-1] + (position - low) * (part[1:] - part[:-1])
 
 
-def observe(case: Case, world: World, limit: jax.Array) -> Scene:
+def observe(
+    case: Case, world: World, limit: jax.Array, steers: bool = False
+) -> Scene:
     """The planning frame of one case now.
+
+    Where the planner `steers`, the reference line is the middle of the lane that the
+    ego is on, as in training scenes, and the road is what the route leaves free.
 
     Args:
       case: the drive.
       world: its state.
       limit: [R] m/s, `road_limit(case.road)`, computed once per case.
+      steers: the planner plans paths, not speed along the given one.
     """
     ego, road = world.ego, case.road
     kappa = lookup(road.kappa, ego.s, ROAD_STEP_M)
     shrink = jnp.maximum(1.0 - kappa * ego.l, 0.1)
     flat = jnp.ones((NUM_STATIONS,))
-    lane = road.lane_width * jnp.round(ego.l / road.lane_width)
-    path = Path(
-        kappa=_window(road.kappa, ego.s),
-        l=_window(road.path_l, ego.s),
-        speed_limit=_window(limit, ego.s),
-        lane_left=(lane + 0.5 * road.lane_width) * flat,
-        lane_right=(lane - 0.5 * road.lane_width) * flat,
-        road_left=road.edge_left * flat,
-        road_right=road.edge_right * flat,
-    )
+    if steers:
+        middle = lane_centre(road, ego.l)
+        ego = ego.replace(l=ego.l - middle)
+        kappa = kappa / jnp.maximum(1.0 - kappa * middle, 0.1)
+        bend = _window(road.kappa, ego.s)
+        path = Path(
+            kappa=bend / jnp.maximum(1.0 - bend * middle, 0.1),
+            l=0.0 * flat,
+            speed_limit=_window(limit, ego.s),
+            lane_left=0.5 * road.lane_width * flat,
+            lane_right=-0.5 * road.lane_width * flat,
+            road_left=_window(road.route_left, ego.s) - middle,
+            road_right=_window(road.route_right, ego.s) - middle,
+        )
+    else:
+        lane = road.lane_width * jnp.round(ego.l / road.lane_width)
+        path = Path(
+            kappa=_window(road.kappa, ego.s),
+            l=_window(road.path_l, ego.s),
+            speed_limit=_window(limit, ego.s),
+            lane_left=(lane + 0.5 * road.lane_width) * flat,
+            lane_right=(lane - 0.5 * road.lane_width) * flat,
+            road_left=road.edge_left * flat,
+            road_right=road.edge_right * flat,
+        )
     seen_ego = Ego(
         s=jnp.zeros(()),
         l=ego.l,
@@ -405,11 +461,14 @@ def observe(case: Case, world: World, limit: jax.Array) -> Scene:
         length=case.ego_length,
         width=case.ego_width,
     )
+    bodies = _bodies(case, world, perceive(case, world))
+    if steers:
+        bodies = bodies.replace(l=bodies.l - middle)
     return Scene(
         ego=seen_ego,
         path=path,
         obstacles=obstacles_of(
-            _bodies(case, world, perceive(case, world)),
+            bodies,
             stop_line(case, world, ego) - ego.s,
             road.destination - ego.s,
             seen_ego,
@@ -532,6 +591,7 @@ def step(
     fallback: jax.Array,
     vehicle: Vehicle,
     follow_log: jax.Array | bool = False,
+    planned: jax.Array | None = None,
 ) -> tuple[World, Record]:
     """One tick of 0.1 s.
 
@@ -542,12 +602,13 @@ def step(
       fallback: bool, of the plan in force (only logged).
       vehicle: the ego's limits and lags.
       follow_log: bool, the ego is the recorded human, where there is one.
+      planned: [3, 2] the planned path, as in `steering`; None: the given one.
 
     Returns:
       The world one step later and the record of that later moment.
     """
     ego, replay = world.ego, _replay(case)
-    moved_ego = drive(ego, case.road, acceleration, vehicle)
+    moved_ego = drive(ego, case.road, acceleration, vehicle, planned)
     human = _human(replay, ego, world.step + 1)
     moved_ego = either(follow_log, human, moved_ego)
     state, induced = _advance_agents(case, world)

@@ -31,6 +31,7 @@ def make_case(
 ):  # fmt: skip
     """A straight (or given) road; agents and lines override what is neutral."""
     grid, f = np.ones((NUM_ROAD,), np.float32), np.float32
+    left, right = 3.5 * (lanes[0] + 0.5) + 0.5, -3.5 * (lanes[1] + 0.5) - 0.5
     return Case(
         seed=np.uint32(seed),
         steps=np.int32(steps),
@@ -44,8 +45,10 @@ def make_case(
             lane_width=f(3.5),
             lanes_left=np.int32(lanes[0]),
             lanes_right=np.int32(lanes[1]),
-            edge_left=f(3.5 * (lanes[0] + 0.5) + 0.5),
-            edge_right=f(-3.5 * (lanes[1] + 0.5) - 0.5),
+            edge_left=f(left),
+            edge_right=f(right),
+            route_left=np.asarray(left * grid, f),
+            route_right=np.asarray(right * grid, f),
             destination=f(1e6),
         ),
         lines=lines_of([LINE | line for line in lines]),
