@@ -70,7 +70,9 @@ ONLINE_PATHS = dataclasses.replace(
     ONLINE,
     mode="path_speed",
     lateral_times=(4.0, 7.0),
-    nudge_offsets=(-0.5, 0.5),
+    min_lateral_length=12.0,
+    nudge_offsets=(),
+    pass_gap=0.45,
     lateral_always=(1,),
     lateral_stride=5,
 )

@@ -10,7 +10,8 @@ It is the same for learned, hand-set and random scores. For each candidate:
 4. a distance from which braking still avoids the leader (RSS, Shalev-Shwartz
    et al. 2017), or at least a growing margin where another car took it away;
 5. where paths are planned, the same distance to whom the ego moves in behind, and one
-   from which whoever it moves in ahead of can brake gently.
+   from which whoever it moves in ahead of can brake gently; before what never moves,
+   room to get round it.
 
 `check` tells which candidates keep all rules, `explain` which rule each breaks first.
 Numbers of an obstacle at times when it is not there are never read.
@@ -48,6 +49,7 @@ Trajectory = Any
 MOVING_MPS = 1.0  # m/s, above which a body's prediction is uncertain
 CROSSING_MPS = 1.0  # m/s, sideways speed above which a body is no lead vehicle
 FREE_M = 1e3  # m, the margin to a leader where there is none
+NEARER_M = 0.2  # m by which one comes nearer in earnest
 
 
 TRACKS = ("full", "collision")
@@ -92,6 +94,8 @@ class SafetyConfig:
     # s and m/s^2, reaction and braking of who is behind then
     rear_reaction: float = 0.6
     rear_braking: float = 3.0
+    # m kept before what never moves, to get round it
+    room: float = 8.0
 
     def __post_init__(self) -> None:
         """Reject an unknown track."""
@@ -370,6 +374,9 @@ def _crowds(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
 
         ahead:   gap >= d of `_rss_distance`
         behind:  gap >= v_r rho_r + max(v_r^2 - v^2, 0) / (2 b_r) + standstill
+
+    It also comes too near where it ends up nearer than `room` behind what never moves,
+    and nearer than now.
     """
     obstacles, ego = scene.obstacles, scene.ego
     xp = namespace(x.s, obstacles.s_lower)
@@ -393,7 +400,11 @@ def _crowds(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
             before < _rss_distance(x.v, speed, config),
             after < xp.where(speed > 0.0, behind, 0.0) + config.standstill,
         )
-        yield enters & near[1:]
+        crowds = enters & near[1:]
+        stuck = (obstacles.kind[n] == Kind.STATIC) & valid & (aside(x.l) < reach) & ahead
+        stuck = stuck & (before < config.room) & (before < before[:1] - NEARER_M)
+        last = xp.arange(1, x.s.shape[0])[:, None] == x.s.shape[0] - 1
+        yield crowds | (stuck[1:] & last)
 
 
 def _rss(scene: Scene, x: Motion, config: SafetyConfig) -> tuple[Array, Array]:

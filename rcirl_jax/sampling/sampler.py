@@ -89,12 +89,14 @@ class SamplerConfig:
     reach_acceleration: float = 2.0
     # 1, end speeds are capped at this multiple of the limit at the ego
     limit_factor: float = 1.2
-    # s, durations from which lateral moves are drawn (times v0 = length)
+    # s, durations from which lateral moves are drawn, at the candidate's own speed
     lateral_times: tuple[float, ...] = (3.0, 5.0)
     # m, shortest lateral move
     min_lateral_length: float = 15.0
     # m, offsets of nudges from the lateral position at t = 0
     nudge_offsets: tuple[float, ...] = (-0.8, -0.4, 0.4, 0.8)
+    # m, gap at which what is in the way is passed; 0: no such profiles
+    pass_gap: float = 0.0
     # lateral profiles with which every speed profile is paired; 0: hold, 1: centre
     lateral_always: tuple[int, ...] = (0, 1)
     # every n-th speed profile is paired with each further lateral profile
@@ -233,15 +235,12 @@ def sample(key: jax.Array, scene: Scene, config: SamplerConfig) -> Candidates:
             allowed = jnp.ones(family.shape, bool)
         else:
             which_speed, which_lateral = _pairs(config)
-            target, length, allowed = lateral_targets(scene, config)
-            trajectory = jax.vmap(_with_lateral, in_axes=(None, 0, 0, 0))(
-                scene,
-                stations[which_speed],
-                target[which_lateral],
-                length[which_lateral],
+            moves = Moves(*jnp.stack(lateral_moves(scene, config))[:, which_lateral])
+            trajectory = jax.vmap(_with_lateral, in_axes=(None, 0, 0))(
+                scene, stations[which_speed], moves
             )
             family = family[which_speed]
-            allowed = allowed[which_lateral] > 0.0
+            allowed = moves.allowed > 0.0
         inside = jax.vmap(lambda x: within_limits(scene, x, config))(trajectory)
         is_emergency = family == family_index("emergency")
         if config.mode != "speed" and not config.own:
@@ -320,8 +319,8 @@ def _own_offsets(
     _, given = own_positions(config.own, config.own_sha256, scene, key)
     if given is None:
         raise InputError(f"{config.own}: s alone: expected s, l where l is planned")
-    target, length, _ = lateral_targets(scene, config)
-    hold = jax.vmap(lambda s: lateral_offset(scene, target[0], length[0], s))(stations)
+    held = Moves(*jnp.stack(lateral_moves(scene, config))[:, 0])
+    hold = jax.vmap(lambda s: lateral_offset(scene, held, s))(stations)
     after = 1 + given.shape[0]
     return jnp.concatenate([hold[:1], given, hold[after:]])
 
@@ -563,18 +562,35 @@ def _second_phases(
 
 
 def num_lateral(config: SamplerConfig) -> int:
-    """Number of lateral profiles: hold, centre, two neighbours each time, nudges."""
-    return 1 + 3 * len(config.lateral_times) + len(config.nudge_offsets)
+    """Number of lateral profiles: hold, centre, two neighbours each time, nudges, passes."""
+    passes = 2 if config.pass_gap else 0
+    return 1 + 3 * len(config.lateral_times) + len(config.nudge_offsets) + passes
 
 
-def lateral_targets(
-    scene: Scene, config: SamplerConfig
-) -> tuple[Float[Array, " m"], Float[Array, " m"], Float[Array, " m"]]:
-    """Target offset [m], length of the move [m] and its validity per profile.
+class Moves(NamedTuple):
+    """Lateral profiles; all [m]."""
 
-    Profile 0 holds the offset of t = 0, profile 1 goes to the lane's centre;
-    the others are neighbouring lanes (valid inside the road's edges) and
-    nudges. A move takes `lateral_times` at the present speed.
+    target: jax.Array  # m, offset that it leads to
+    seconds: jax.Array  # s that it takes, at the candidate's own speed
+    shortest: jax.Array  # m that it takes at least
+    longest: jax.Array  # m that it takes at most
+    back: jax.Array  # m, station from which it leads to the lane's centre; inf
+    allowed: jax.Array  # 1 or 0: there is such a lane
+
+
+# 1, largest curvature of a quintic move of offset y over length L, times L^2 / y
+MOVE_CURVATURE = 10.0 / 3.0**0.5
+BESIDE_M = 0.35  # m beside the ego's box within which a body is passed
+GROUP_M = 40.0  # m; standing bodies nearer than that to the first are passed with it
+PAST_M = 3.0  # m beyond the last of them at which the way back begins
+
+
+def lateral_moves(scene: Scene, config: SamplerConfig) -> Moves:
+    """The lateral profiles of a scene.
+
+    Profile 0 holds the offset of t = 0, profile 1 goes to the lane's centre; the others
+    are neighbouring lanes (allowed inside the road's edges), nudges, and past what is in
+    the way, on its left and on its right, and back where that stands.
     """
     ego, path = scene.ego, scene.path
     left = lookup(path.lane_left, ego.s, STATION_STEP_M)
@@ -584,40 +600,90 @@ def lateral_targets(
         lookup(path.road_right, ego.s, STATION_STEP_M) + 0.5 * ego.width,
         lookup(path.road_left, ego.s, STATION_STEP_M) - 0.5 * ego.width,
     )
-    targets, times = [ego.l], [max(config.lateral_times)]
+    slow = max(config.lateral_times)
+    targets, times = [ego.l], [slow]
     for shift in (0.0, 1.0, -1.0):
-        for time in config.lateral_times:
-            targets.append(centre + shift * width)
-            times.append(time)
-    for offset in config.nudge_offsets:
-        targets.append(ego.l + offset)
-        times.append(max(config.lateral_times))
-    target = jnp.stack([jnp.asarray(value, jnp.float32) for value in targets])
-    lengths = jnp.asarray(times, jnp.float32) * ego.v
+        targets += [centre + shift * width] * len(config.lateral_times)
+        times += config.lateral_times
+    targets += [ego.l + offset for offset in config.nudge_offsets]
+    times += [slow] * len(config.nudge_offsets)
+    count = len(targets)
+    shortest, longest = [config.min_lateral_length] * count, [jnp.inf] * count
+    back = [jnp.inf] * count
+    if config.pass_gap:
+        sides, begin, end = _in_front(scene, centre)
+        clear = 0.5 * ego.width + config.pass_gap
+        for target in (sides[1] + clear, sides[0] - clear):
+            targets.append(target)
+            times.append(min(config.lateral_times))
+            bend = MOVE_CURVATURE / (0.8 * config.max_curvature)
+            shortest.append(jnp.sqrt(bend * jnp.abs(target - ego.l)))
+            longest.append(jnp.maximum(begin - ego.s, shortest[-1]))
+            back.append(end)
+    target, seconds, shortest, longest, back = (
+        jnp.stack([jnp.asarray(value, jnp.float32) for value in values])
+        for values in (targets, times, shortest, longest, back)
+    )
     inside = (target >= road[0]) & (target <= road[1])
     free = jnp.arange(target.size) < 1 + len(config.lateral_times)
-    return (
-        target,
-        jnp.maximum(lengths, config.min_lateral_length),
-        (inside | free).astype(jnp.float32),
+    allowed = (inside | free).astype(jnp.float32)
+    return Moves(target, seconds, shortest, longest, back, allowed)
+
+
+def _in_front(
+    scene: Scene, centre: jax.Array
+) -> tuple[tuple[jax.Array, jax.Array], jax.Array, jax.Array]:
+    """What is to be passed: the nearest body in the lane's middle, and those with it.
+
+    Returns:
+      Offsets m of its right and left side, the station m at which the ego has to be
+      beside it, and that from which it may go back, inf while one of them moves.
+      Without a body all is far away.
+    """
+    o, ego = scene.obstacles, scene.ego
+    lower, upper = o.s_lower[:, 0], o.s_upper[:, 0]
+    right, left = o.l_lower[:, 0], o.l_upper[:, 0]
+    aside = jnp.maximum(right - centre, centre - left)
+    is_body = (o.kind != Kind.NONE) & (o.kind < Kind.STOP) & o.valid[:, 0]
+    half = 0.5 * ego.length
+    ahead = is_body & (upper + half > ego.s) & (aside < 0.5 * ego.width + BESIDE_M)
+    first = jnp.min(jnp.where(ahead, lower, jnp.inf))
+    group = ahead & (lower < first + GROUP_M)
+    sides = (
+        jnp.min(jnp.where(group, right, jnp.inf)),
+        jnp.max(jnp.where(group, left, -jnp.inf)),
     )
+    moves = jnp.any(group & (jnp.abs(o.speed[:, 0]) > START_MPS))
+    last = jnp.max(jnp.where(group, upper, -jnp.inf)) + half + PAST_M
+    found = jnp.any(group)
+    # infinite numbers would make the curves NaN
+    sides = tuple(jnp.where(found, side, 1e3) for side in sides)
+    begin = jnp.where(found, first - half, 1e3)
+    return sides, begin, jnp.where(found & ~moves, last, jnp.inf)
 
 
 def lateral_offset(
-    scene: Scene, target: jax.Array, length: jax.Array, s: Float[Array, " t"]
+    scene: Scene, move: Moves, s: Float[Array, " t"]
 ) -> Float[Array, " t"]:
-    """L [T] m along stations s: a quintic in s to the target, then constant."""
+    """L [T] m along stations s, of one profile.
+
+    A quintic in s to the target over the way of `seconds`, then constant; then a quintic
+    back to the lane's centre over as long a way.
+    """
     ego = scene.ego
-    curve = quintic(ego.l, ego.dl, ego.ddl, target, 0.0, 0.0, length)
-    way = jnp.clip(s - ego.s, 0.0, length)
-    return evaluate(curve[None], way)[0]
+    way = lookup(s, move.seconds / DT_S, 1.0) - ego.s
+    length = jnp.clip(way, move.shortest, move.longest)
+    curve = quintic(ego.l, ego.dl, ego.ddl, move.target, 0.0, 0.0, length)
+    there = evaluate(curve[None], jnp.clip(s - ego.s, 0.0, length))[0]
+    home = 0.5 * (scene.path.lane_left[0] + scene.path.lane_right[0])
+    share = jnp.clip((s - move.back) / jnp.maximum(way, move.shortest), 0.0, 1.0)
+    return there + (home - move.target) * share**3 * (
+        10.0 - 15.0 * share + 6.0 * share**2
+    )
 
 
-def _with_lateral(
-    scene: Scene, s: jax.Array, target: jax.Array, length: jax.Array
-) -> Trajectory:
-    l = lateral_offset(scene, target, length, s)
-    return trajectory_from_positions(scene, s, l)
+def _with_lateral(scene: Scene, s: jax.Array, move: Moves) -> Trajectory:
+    return trajectory_from_positions(scene, s, lateral_offset(scene, move, s))
 
 
 def within_limits(

@@ -228,8 +228,8 @@ def _compiled(policy: Policy, plan_every: int, length: int, vehicle: Vehicle) ->
             see = functools.partial(observe, steers=steers)
             scenes = jax.vmap(see)(cases, now.worlds, limits)
             plans = now.plan
-            if steers:  # a scene's offsets are from the middle of the ego's lane
-                middle = jax.vmap(lane_centre)(cases.road, now.worlds.ego.l)
+            if steers:  # a scene's offsets are from the middle of a lane
+                middle = jax.vmap(lane_centre)(cases.road, now.worlds.ego)
                 plans = jax.vmap(beside)(plans, middle)
             plans = jax.vmap(plan_of)(scenes, keys, now.worlds, plans, cases.seed)
             if steers:

@@ -349,10 +349,23 @@ def road_limit(road: Road, steers: bool = False) -> jax.Array:
     return planning_limit(road.kappa, path_l, road.speed_limit, ROAD_STEP_M, jnp)
 
 
-def lane_centre(road: Road, l: jax.Array) -> jax.Array:
-    """Centre [] m of the lane at an offset [] m, among those of the ego's direction."""
-    lane = jnp.clip(jnp.round(l / road.lane_width), -road.lanes_right, road.lanes_left)
-    return road.lane_width * lane
+EDGE_SHARE = 0.05  # 1, of a lane's width, by which a free lane may be narrower
+
+
+def lane_centre(road: Road, ego: EgoState) -> jax.Array:
+    """Centre [] m of the lane that the ego is on, of those of its direction.
+
+    Where that lane ends within the planner's view, it is that of the nearest lane which
+    does not, if there is one.
+    """
+    width = road.lane_width
+    own = jnp.clip(jnp.round(ego.l / width), -road.lanes_right, road.lanes_left)
+    highest = jnp.min(_window(road.route_left, ego.s)) / width
+    lowest = jnp.max(_window(road.route_right, ego.s)) / width
+    highest = jnp.minimum(jnp.floor(highest - 0.5 + EDGE_SHARE), road.lanes_left)
+    lowest = jnp.maximum(jnp.ceil(lowest + 0.5 - EDGE_SHARE), -road.lanes_right)
+    goes_on = jnp.where(lowest <= highest, jnp.clip(own, lowest, highest), own)
+    return width * goes_on
 
 
 SEEN = ("s", "l", "heading", "v", "a", "present")  # rows of `World.seen`
@@ -427,7 +440,7 @@ def observe(
     shrink = jnp.maximum(1.0 - kappa * ego.l, 0.1)
     flat = jnp.ones((NUM_STATIONS,))
     if steers:
-        middle = lane_centre(road, ego.l)
+        middle = lane_centre(road, ego)
         ego = ego.replace(l=ego.l - middle)
         kappa = kappa / jnp.maximum(1.0 - kappa * middle, 0.1)
         bend = _window(road.kappa, ego.s)
