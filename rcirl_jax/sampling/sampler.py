@@ -608,7 +608,7 @@ def lateral_moves(scene: Scene, config: SamplerConfig) -> Moves:
     targets += [ego.l + offset for offset in config.nudge_offsets]
     times += [slow] * len(config.nudge_offsets)
     count = len(targets)
-    shortest, longest = [config.min_lateral_length] * count, [jnp.inf] * count
+    least, longest = [config.min_lateral_length] * count, [jnp.inf] * count
     back = [jnp.inf] * count
     if config.pass_gap:
         sides, begin, end = _in_front(scene, centre)
@@ -616,14 +616,21 @@ def lateral_moves(scene: Scene, config: SamplerConfig) -> Moves:
         for target in (sides[1] + clear, sides[0] - clear):
             targets.append(target)
             times.append(min(config.lateral_times))
-            bend = MOVE_CURVATURE / (0.8 * config.max_curvature)
-            shortest.append(jnp.sqrt(bend * jnp.abs(target - ego.l)))
-            longest.append(jnp.maximum(begin - ego.s, shortest[-1]))
+            least.append(0.0)
+            longest.append(begin - ego.s)
             back.append(end)
-    target, seconds, shortest, longest, back = (
+    target, seconds, least, longest, back = (
         jnp.stack([jnp.asarray(value, jnp.float32) for value in values])
-        for values in (targets, times, shortest, longest, back)
+        for values in (targets, times, least, longest, back)
     )
+    # neither bends more than the car can, nor more than half of what is allowed at the
+    # speed now: between the times of a trajectory nobody would see it
+    bend = jnp.maximum(
+        1.25 / config.max_curvature, 2.0 * ego.v**2 / config.max_lateral_acceleration
+    )
+    bend = MOVE_CURVATURE * bend * jnp.abs(target - ego.l)
+    shortest = jnp.maximum(least, jnp.sqrt(bend))
+    longest = jnp.maximum(longest, shortest)
     inside = (target >= road[0]) & (target <= road[1])
     free = jnp.arange(target.size) < 1 + len(config.lateral_times)
     allowed = (inside | free).astype(jnp.float32)
