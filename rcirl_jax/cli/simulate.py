@@ -40,8 +40,8 @@ from rcirl_jax.export.closed_loop import (
 )
 from rcirl_jax.planner.program import processes_of
 from rcirl_jax.planner.safety import TRACKS
-from rcirl_jax.sampling.sampler import MODES
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
+from rcirl_jax.sampling.sampler import MODES
 from rcirl_jax.simulation.recorded import held_out
 from rcirl_jax.simulation.rows import BASELINES, human_row
 from rcirl_jax.simulation.suite import case_duration, recorded_set, suite_refs
@@ -75,8 +75,8 @@ _MODE = flags.DEFINE_enum(
     "mode",
     None,
     MODES,
-    "what baselines that rank candidates plan: speed along the given path, or path_speed; "
-    "default: what the first weights were trained for",
+    "what baselines that rank candidates plan: speed along the given path, or the path "
+    "too; default: what the first weights were trained for",
 )
 _EXECUTOR = shared.executor()
 _CASES = shared.suite("smoke")

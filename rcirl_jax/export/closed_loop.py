@@ -75,8 +75,8 @@ from rcirl_jax.planner.rank import (
     ranking_score,
 )
 from rcirl_jax.planner.safety import SafetyConfig
-from rcirl_jax.reward.speed_dp import SPEED_DP_ROW
 from rcirl_jax.reward import RewardConfig, fit_normaliser, init_params, seen_range
+from rcirl_jax.reward.speed_dp import SPEED_DP_ROW
 from rcirl_jax.runtime.atomic_files import read_json, write_json
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.runtime.executors import Executor
@@ -176,8 +176,8 @@ def table_rows(
     again by `dp`. A tuned IDM comes last. `track` is the safety filter's
     (`SafetyConfig`), `own` the place of the user's own cost, a baseline by its name.
     `planners` are names of rows ("" for a program's own) and `planner.program` places.
-    Weights plan what they were trained to plan, the other rows that rank candidates what
-    `mode` says, or else the first file's; the rest plan speed along the given path.
+    Weights plan what they were trained to plan, other rows that rank candidates what
+    `mode` says or else the first file's; the rest plan speed along the given path.
 
     Raises:
       InputError: no file and no planner, an unreadable one, one twice without `names`,

@@ -1,8 +1,9 @@
 """The plan that answers a scene, and how it is followed until the next one.
 
-A plan is s(t), v(t), a(t) on the time axis, with a path l(s) or on a given one. Until the next planning step the ego
-follows it (`command`), and that step has the rest of it among its candidates
-(`stations_from_now`), so that the trajectory that was valued is the one that is driven.
+A plan is s(t), v(t), a(t) on the time axis, along the given path or with one of its own
+(`path_at`). Until the next planning step the ego follows it (`command`), and that step
+has the rest of it among its candidates (`stations_from_now`), so that the trajectory
+that was valued is the one that is driven.
 
 Keep a plan for a while, and plan again only when that is necessary.
 

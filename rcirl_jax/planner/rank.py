@@ -65,7 +65,7 @@ ONLINE = SamplerConfig(
     stop_brakings=(0.8, 1.5, 2.5),
     num_random=8,
 )
-# The same speeds in the middle of the lane, every fifth with other paths: 168 candidates.
+# The same speeds to the middle of the lane, every fifth on other paths: 168 candidates.
 ONLINE_PATHS = dataclasses.replace(
     ONLINE,
     mode="path_speed",

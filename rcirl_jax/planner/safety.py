@@ -401,7 +401,9 @@ def _crowds(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
             after < xp.where(speed > 0.0, behind, 0.0) + config.standstill,
         )
         crowds = enters & near[1:]
-        stuck = (obstacles.kind[n] == Kind.STATIC) & valid & (aside(x.l) < reach) & ahead
+        stuck = (
+            (obstacles.kind[n] == Kind.STATIC) & valid & (aside(x.l) < reach) & ahead
+        )
         stuck = stuck & (before < config.room) & (before < before[:1] - NEARER_M)
         last = xp.arange(1, x.s.shape[0])[:, None] == x.s.shape[0] - 1
         yield crowds | (stuck[1:] & last)

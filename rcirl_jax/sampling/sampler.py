@@ -562,7 +562,7 @@ def _second_phases(
 
 
 def num_lateral(config: SamplerConfig) -> int:
-    """Number of lateral profiles: hold, centre, two neighbours each time, nudges, passes."""
+    """Number of lateral profiles: hold, centre, neighbours, nudges and passes."""
     passes = 2 if config.pass_gap else 0
     return 1 + 3 * len(config.lateral_times) + len(config.nudge_offsets) + passes
 
@@ -588,9 +588,9 @@ PAST_M = 3.0  # m beyond the last of them at which the way back begins
 def lateral_moves(scene: Scene, config: SamplerConfig) -> Moves:
     """The lateral profiles of a scene.
 
-    Profile 0 holds the offset of t = 0, profile 1 goes to the lane's centre; the others
-    are neighbouring lanes (allowed inside the road's edges), nudges, and past what is in
-    the way, on its left and on its right, and back where that stands.
+    Profile 0 holds the offset of t = 0, profile 1 goes to the lane's centre; the
+    others are neighbouring lanes (allowed inside the road's edges), nudges, and past
+    what is in the way, on its left and on its right, and back where that stands.
     """
     ego, path = scene.ego, scene.path
     left = lookup(path.lane_left, ego.s, STATION_STEP_M)
@@ -674,8 +674,8 @@ def lateral_offset(
 ) -> Float[Array, " t"]:
     """L [T] m along stations s, of one profile.
 
-    A quintic in s to the target over the way of `seconds`, then constant; then a quintic
-    back to the lane's centre over as long a way.
+    A quintic in s to the target over the way of `seconds`, then constant; then a
+    quintic back to the lane's centre over as long a way.
     """
     ego = scene.ego
     way = lookup(s, move.seconds / DT_S, 1.0) - ego.s

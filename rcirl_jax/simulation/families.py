@@ -74,7 +74,9 @@ def road_of(road: dict[str, float], parts: Parts) -> Road:
     )
 
 
-ON_LANE = 0.02  # 1, of a lane's width: nearer to its middle a path is on that lane alone
+ON_LANE = (
+    0.02  # 1, of a lane's width: nearer to its middle a path is on that lane alone
+)
 
 
 def _route(
@@ -82,8 +84,8 @@ def _route(
 ) -> dict[str, np.ndarray]:
     """Edges [R] m of the lanes that the route leaves free, fields of `Road`.
 
-    Free are the lanes that the given path is on, both while it goes from one to another,
-    and those that a [[route]] opens. The outermost lanes come with their shoulder.
+    Free are the lanes that the given path is on, both while it goes from one to the
+    other, and those that a [[route]] opens. The outermost come with their shoulder.
 
     Args:
       road: its numbers.

@@ -162,9 +162,7 @@ def _begin(cases: Case, steers: bool = False) -> tuple[Now, jax.Array]:
 
 
 @functools.partial(jax.jit, static_argnames="steers")
-def _seen(
-    cases: Case, worlds: World, limits: jax.Array, steers: bool = False
-) -> Scene:
+def _seen(cases: Case, worlds: World, limits: jax.Array, steers: bool = False) -> Scene:
     """The planning frames [B] of worlds [B]."""
     see = functools.partial(observe, steers=steers)
     return jax.vmap(see)(cases, worlds, limits)
@@ -382,9 +380,7 @@ def _layout(case: Any, kinds: tuple, steers: bool) -> tuple[list, Any]:  # noqa:
 
 
 @functools.lru_cache(maxsize=8)
-def _reducer(
-    reduce: Callable[[Record], Logs], steps: int, steers: bool
-) -> Callable:
+def _reducer(reduce: Callable[[Record], Logs], steps: int, steers: bool) -> Callable:
     """A program of its own: whoever drove, records are judged by the same."""
 
     def judge(spans: list[jax.Array], cases: Case) -> Logs:

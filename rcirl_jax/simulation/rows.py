@@ -73,6 +73,11 @@ class Row:
     seed: int = 0
 
     @property
+    def steers(self) -> bool:
+        """True if it plans paths too, not speed along the given one."""
+        return getattr(self.policy, "steers", False)
+
+    @property
     def program(self) -> Program | None:
         """The user's program that plans, where one does."""
         return getattr(self.policy, "program", None)

@@ -421,9 +421,7 @@ def _window(table: jax.Array, s: jax.Array) -> jax.Array:
     return part[:-1] + (position - low) * (part[1:] - part[:-1])
 
 
-def observe(
-    case: Case, world: World, limit: jax.Array, steers: bool = False
-) -> Scene:
+def observe(case: Case, world: World, limit: jax.Array, steers: bool = False) -> Scene:
     """The planning frame of one case now.
 
     Where the planner `steers`, the reference line is the middle of the lane that the

@@ -198,6 +198,11 @@ class Driver:
     """
 
     def __init__(self, row: Row, seeds: Sequence[int]) -> None:
+        if row.steers:
+            raise InputError(
+                f"{row.name}: mode: path_speed: expected speed: in other simulators "
+                "planners drive along given paths"
+            )
         self._row, self._step = row, _step_of(row.policy, Vehicle())
         self._plans = jax.tree.map(
             lambda x: jnp.broadcast_to(x, (len(seeds), *jnp.shape(x))), no_plan()

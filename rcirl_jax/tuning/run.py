@@ -100,7 +100,8 @@ class TuneConfig:
             raise InputError(f"seeds: {self.seeds}: expected at least 1")
         if self.train.sampler.mode != "speed":
             raise InputError(
-                f"mode: {self.train.sampler.mode}: the closed loop plans speed"
+                f"mode: {self.train.sampler.mode}: expected speed: demonstrations are "
+                "driven along given paths; `rcirl train` learns paths"
             )
         self.train.reward.check_own()
 

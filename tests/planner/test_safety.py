@@ -10,14 +10,19 @@ import pytest
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.rank import ONLINE
 from rcirl_jax.planner.safety import (
+    Reason,
     SafetyConfig,
     Verdict,
     check,
     choose,
+    explain,
     first_contact,
     motion_of,
 )
-from rcirl_jax.sampling.kinematics import trajectory_on_path
+from rcirl_jax.sampling.kinematics import (
+    trajectory_from_positions,
+    trajectory_on_path,
+)
 from rcirl_jax.sampling.sampler import as_candidates
 from rcirl_jax.types import Kind
 from rcirl_jax.units import DT_S, TIMES_S
@@ -222,3 +227,64 @@ def test_the_collision_track_forbids_contacts_and_lines_only():
 def test_an_unknown_track_is_one_line():
     with pytest.raises(InputError, match="track: rss: expected one of"):
         SafetyConfig(track="rss")
+
+
+ENTRY = jax.jit(lambda s, c: check(s, c, SafetyConfig(entry=True)))
+
+
+def moving_left(made, v, seconds=4.0):
+    """Candidates of constant speed: one in its lane, one to 3.6 m on the left."""
+    t = jnp.asarray(TIMES_S)
+    u = jnp.clip(t / seconds, 0.0, 1.0)
+    l = 3.6 * u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+    paths = jnp.stack([0.0 * l, l])
+    make = jax.vmap(trajectory_from_positions, in_axes=(None, None, 0))
+    return as_candidates(make(made, v * t, paths))
+
+
+@pytest.mark.parametrize(
+    ("gap", "speed", "fine"),
+    [
+        # behind, as fast: 0.6 s and 1 m, here 13 m; ahead, as fast: RSS, here 12.6 m
+        (-12.0, 20.0, False), (-14.0, 20.0, True),
+        (11.0, 20.0, False), (14.0, 20.0, True),
+        # 24 m/s from behind needs 0.6 s, 29 m to brake to 20 m/s with 3 m/s^2, and 1 m
+        (-45.0, 24.0, False),
+    ],
+)  # fmt: skip
+def test_whoever_is_met_in_a_lane_that_is_entered_has_room(gap, speed, fine):
+    half = 0.5 * (4.9 + 4.0)
+    s = gap + (half if gap > 0.0 else -half)
+    made = with_obstacle(Kind.VEHICLE, s, 3.6, v=20.0, speed=speed)
+    both = moving_left(made, 20.0)
+    assert np.asarray(ENTRY(made, both).admissible).tolist() == [True, fine]
+    told = explain(*jax.tree.map(np.asarray, (made, both)), SafetyConfig(entry=True))
+    assert told.reason[0] == Reason.NONE
+    assert (told.reason[1] == Reason.NONE) == fine
+    if not fine and speed == 20.0:
+        assert (told.reason[1], told.obstacle[1]) == (Reason.ENTRY, 0)
+
+
+def test_one_who_changes_lane_towards_the_ego_is_not_entered():
+    made = with_obstacle(Kind.VEHICLE, -30.0, 3.6, v=20.0, speed=20.0, sideways=-0.4)
+    keeps = jax.tree.map(lambda x: x[:1], moving_left(made, 20.0))
+    assert bool(ENTRY(made, keeps).admissible[0])
+
+
+def test_room_is_kept_before_what_never_moves():
+    """To 6 m before a parked car, or on to the left; who is nearer may stay."""
+    made = with_obstacle(Kind.STATIC, 30.0, 0.0, v=5.0)
+    t = jnp.asarray(TIMES_S)
+
+    def stops(way):
+        to = jnp.minimum(t, way / 2.5)  # 5 m/s until it stands
+        return 5.0 * to - 0.5 * (25.0 / (2.0 * way)) * to**2
+
+    gap = 30.0 - 0.5 * (4.9 + 4.0)
+    make = jax.vmap(trajectory_from_positions, in_axes=(None, 0, None))
+    ways = jnp.array([gap - 6.0, gap - 9.0])
+    halts = as_candidates(make(made, jax.vmap(stops)(ways), 0.0 * t))
+    assert np.asarray(judge(made, halts).admissible).all()
+    assert np.asarray(ENTRY(made, halts).admissible).tolist() == [False, True]
+    near = with_obstacle(Kind.STATIC, 10.0, 0.0, v=0.0)
+    assert bool(ENTRY(near, straight(near, 0.0)).admissible[0])

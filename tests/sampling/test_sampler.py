@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.planner.rank import ONLINE_PATHS
 from rcirl_jax.sampling import (
     FAMILIES,
     SamplerConfig,
@@ -20,7 +21,7 @@ from rcirl_jax.sampling import (
 from rcirl_jax.sampling.sampler import speed_envelope
 from rcirl_jax.types import Kind
 from rcirl_jax.units import STATION_STEP_M, TIMES_S
-from tests.helpers.scenes import batch, random_scene, scene
+from tests.helpers.scenes import batch, random_scene, sampled, scene
 
 CONFIGS = {mode: SamplerConfig(mode=mode) for mode in ("speed", "path_speed")}
 SAMPLE = {
@@ -114,6 +115,35 @@ def test_lanes_beyond_the_road_are_not_feasible():
     candidates = SAMPLE["path_speed"](jax.random.key(0), narrow)
     ends = np.asarray(candidates.trajectory.l)[np.asarray(candidates.feasible), -1]
     assert np.abs(ends).max() < 1.0
+
+
+def test_what_stands_in_the_way_is_passed_on_both_sides_and_the_way_leads_back():
+    """A car 30 m ahead whose left side is at 0.9 m: the ego passes with 0.45 m."""
+    made = scene(v=8.0, boxes=[{"s": 30.0, "kind": Kind.STATIC}])
+    candidates = sampled(jax.random.key(0), made, ONLINE_PATHS)
+    x, fine = candidates.trajectory, np.asarray(candidates.feasible)
+    s, l = np.asarray(x.s)[fine], np.asarray(x.l)[fine]
+    beside = np.abs(s - 30.0) < 0.5 * (4.5 + 4.9)
+    offset = 0.9 + 0.45 + 1.0
+    for side in (1.0, -1.0):
+        passes = (np.where(beside, side * l, 9.0).min(axis=1) > offset - 0.02) & (
+            beside.any(axis=1) & (s[:, -1] > 60.0) & (np.abs(l[:, -1]) < 0.05)
+        )
+        assert passes.any()
+
+
+def test_a_move_takes_its_time_at_the_speed_that_is_driven():
+    """Four seconds to the next lane, braking or accelerating."""
+    made = scene(v=15.0)
+    candidates = sampled(jax.random.key(0), made, ONLINE_PATHS)
+    fine = np.asarray(candidates.feasible)
+    s, l = (
+        np.asarray(x)[fine] for x in (candidates.trajectory.s, candidates.trajectory.l)
+    )
+    there = np.abs(l - 3.6) < 0.02
+    first = np.where(there.any(axis=1), TIMES_S[there.argmax(axis=1)], np.inf)
+    quick = np.abs(first - 4.0) < 0.3
+    assert np.ptp(s[quick, -1]) > 40.0
 
 
 def test_only_the_random_family_depends_on_the_key():

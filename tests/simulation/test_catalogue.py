@@ -94,6 +94,31 @@ def test_a_small_family_by_hand(tmp_path):
     assert np.isinf(agents.script.start[0, 1])
 
 
+def test_the_route_leaves_free_what_the_path_and_the_file_say(tmp_path):
+    """One lane to the left; the path goes there from station 130 on and comes back."""
+
+    def bounds(text, folder=tmp_path):
+        road = build_case(load_family(write(folder, text)), 0).road
+        return road.route_right, road.route_left
+
+    right, left = bounds(SMALL)
+    edge = 1.5 * 3.5 + 0.5  # the outermost lane comes with its shoulder
+    assert (right[20], left[20]) == pytest.approx((-1.75 - 0.5, 1.75))
+    assert (right[75], left[75]) == pytest.approx((-1.75 - 0.5, edge))  # on its way
+    assert (right[90], left[90]) == pytest.approx((1.75, edge))
+    opened = """
+[[route]]
+at = "20"
+length = "30"
+low = "0"
+high = "7"
+"""
+    other = tmp_path / "other"  # a file is read once
+    other.mkdir()
+    _, left = bounds(SMALL + opened, other)
+    assert left[[9, 10, 25, 26]] == pytest.approx([1.75, edge, edge, 1.75])
+
+
 @pytest.mark.parametrize(
     ("change", "names"),
     [

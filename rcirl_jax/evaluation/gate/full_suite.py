@@ -20,7 +20,7 @@ FAMILIES: Mapping[str, int] = dict.fromkeys(
     ),
     180,
 )
-SHA256 = "b67f162b80b4577ea89b93ead4ec0c849c79f502a038784ee39c584d5595d5aa"
+SHA256 = "2ec5c5d42658391808d4f2a160e1c3d18ab42c2766bddbf9ce45a6471820a39f"
 
 
 def families_sha256(names: Iterable[str]) -> str:

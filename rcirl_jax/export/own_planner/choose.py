@@ -43,6 +43,7 @@ TEXTS = {
     Reason.ROAD: "leaves the road at {1:.2f} s",
     Reason.BEND: "has too much lateral acceleration at {1:.2f} s",
     Reason.DISTANCE: "is too near behind {0}",
+    Reason.ENTRY: "moves in too near to {0} at {1:.2f} s",
 }
 
 

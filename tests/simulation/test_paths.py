@@ -1,0 +1,104 @@
+"""Planned paths in closed loop: lanes that are free, and those that are not."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.common import untrained
+from rcirl_jax.errors import InputError
+from rcirl_jax.planner.rank import ONLINE_PATHS, RankConfig
+from rcirl_jax.planner.safety import SafetyConfig
+from rcirl_jax.simulation.cases import EgoState
+from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases, first_scenes
+from rcirl_jax.simulation.rows import baseline_row
+from rcirl_jax.simulation.world import Vehicle, drive, lane_centre
+from rcirl_jax.units import STATION_STEP_M
+from tests.simulation.drives import constant, stack
+from tests.simulation.drives import drive as drive_all
+from tests.simulation.worlds import make_case
+
+PATHS = RankConfig(sampler=ONLINE_PATHS, safety=SafetyConfig(entry=True))
+ROW = baseline_row("hand-set", "paper21", untrained(), PATHS)
+SLOW = {"s": 60.0, "v": 6.0, "desired": 6.0}
+
+
+def road(agents=(), lanes=(1, 0), **more):
+    return make_case([SLOW, *agents], speed=15.0, limit=20.0, lanes=lanes, **more)
+
+
+def closed_left(case):
+    left = np.full_like(case.road.route_left, 1.75)
+    return case.replace(road=case.road.replace(route_left=left))
+
+
+@pytest.fixture(scope="module")
+def driven():
+    fast = {"s": -25.0, "l": 3.5, "v": 25.0, "desired": 25.0}
+    parked = {**SLOW, "l": 3.5, "v": 0.0, "phases": [(0.0, 0.0, 1.0)]}
+    cases = [road(), road(lanes=(0, 0)), road([fast]), road([parked], lanes=(1, 1)),
+             closed_left(road())]  # fmt: skip
+    record, shot = drive_all(cases, 250, policy=ROW.policy, params=ROW.params)
+    assert record.at_fault.sum() == 0
+    return record, shot
+
+
+def test_a_slow_car_is_passed_where_there_is_a_lane(driven):
+    record, _ = driven
+    free, none, _, right, closed = record.l[:, -1]
+    assert free == pytest.approx(3.5, abs=0.1)
+    assert right == pytest.approx(-3.5, abs=0.1)  # somebody stands on the left
+    assert np.abs(record.l[1]).max() < 0.05
+    assert np.abs(record.l[4]).max() < 0.05  # the route does not lead there
+    assert none == pytest.approx(closed)
+    assert record.s[0, -1] > record.s[1, -1] + 100.0
+
+
+def test_nobody_is_cut_up(driven):
+    """A car at 25 m/s comes from 25 m behind: it is let past, or never met."""
+    record, shot = driven
+    entered = np.abs(record.l[2]) > 0.7
+    behind = shot.agents.s[2, :, 1] < record.s[2]
+    assert not (entered & behind & shot.agents.present[2, :, 1]).any()
+    assert record.induced_braking[2].max() < 1.0
+
+
+def test_the_plan_is_what_is_driven_inside_the_limits_of_the_steering(driven):
+    record, shot = driven
+    np.testing.assert_allclose(shot.plan_l[:, 1:, 0], record.l[:, :-1], atol=0.15)
+    assert np.abs(record.curvature).max() <= Vehicle().max_curvature
+    assert np.abs(record.v**2 * record.curvature).max() < 4.0
+
+
+def test_a_planned_path_is_reached_and_followed():
+    case = jax.tree.map(jnp.asarray, make_case(kappa=0.01, lanes=(1, 0)).road)
+    f = jnp.float32
+    ego = EgoState(s=f(0), l=f(0), heading=f(0), v=f(10), a=f(0), curvature=f(0))
+    planned = jnp.zeros((3, 2)).at[0].set(1.5)
+    step = lambda x, _: (drive(x, case, f(0), Vehicle(), planned),) * 2  # noqa: E731
+    _, log = jax.jit(lambda x: jax.lax.scan(step, x, length=100))(ego)
+    assert float(log.l[-1]) == pytest.approx(1.5, abs=0.02)
+    assert float(log.curvature[-1]) == pytest.approx(0.01 / (1 - 0.015), rel=0.02)
+
+
+def test_offsets_are_from_the_lane_that_goes_on():
+    """The ego is in the lane on the right, which ends after 100 m."""
+    case = make_case(path_l=-3.5, lanes=(1, 1))
+    ends = np.where(
+        np.arange(len(case.road.kappa)) * STATION_STEP_M < 100.0, -5.75, -1.75
+    )
+    ends = ends.astype(np.float32)
+    short = case.replace(road=case.road.replace(route_right=ends))
+    scenes = first_scenes(stack([case, short]), steers=True)
+    np.testing.assert_allclose(scenes.ego.l, [0.0, -3.5], atol=1e-6)
+    np.testing.assert_allclose(scenes.path.road_right[:, 0], [-2.25, -5.75], atol=1e-6)
+    np.testing.assert_allclose(scenes.path.road_left[:, 0], [9.25, 5.75], atol=1e-6)
+    now = EgoState(**dict.fromkeys(EgoState.__dataclass_fields__, jnp.float32(0.0)))
+    lanes = jax.tree.map(jnp.asarray, case.road)
+    assert float(lane_centre(lanes, now.replace(l=jnp.float32(9.0)))) == 3.5
+
+
+def test_drivers_in_turn_plan_alike():
+    both = (ROW.policy, ROW.params), (constant, jnp.float32(0.0))
+    with pytest.raises(InputError, match="takeover: one plans paths"):
+        drive_cases(*both[0], stack([road()]), RolloutConfig(steps=5), takeover=both[1])
