@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from rcirl_jax.features import FeatureMap
 from rcirl_jax.planner.own_cost import OwnCost, own_cost
 from rcirl_jax.planner.plan import Plan, PreviousPlan, committed, either, plan_of
-from rcirl_jax.planner.safety import SafetyConfig, check, choose
+from rcirl_jax.planner.safety import SafetyConfig, check, choose, last_resort
 from rcirl_jax.reward.familiarity import familiar_nowhere, familiarity
 from rcirl_jax.reward.hand import LatticeCost, lattice_costs
 from rcirl_jax.reward.network import (
@@ -283,6 +283,12 @@ def best_plan(
       in_force: the plan in force.
     """
     verdict = check(scene, candidates, config.safety)
+    if config.steers:
+        verdict = jax.lax.cond(
+            jnp.any(verdict.admissible),
+            lambda: verdict,
+            lambda: last_resort(scene, candidates, verdict, config.safety),
+        )
     index, fallback = choose(verdict, candidates, scores)
     chosen = jax.tree.map(lambda x: x[index], candidates.trajectory)
     urgent = fallback | (candidates.family[index] == family_index("emergency"))

@@ -244,6 +244,29 @@ def _first_of(times: Array) -> tuple[Array, Array, Array]:
     return xp.isfinite(at), xp.argmin(first, axis=0), at
 
 
+def last_resort(
+    scene: Scene, candidates: Candidates, verdict: Verdict, config: SafetyConfig
+) -> Verdict:
+    """Contacts without margins, and with lines too, for `choose` in need.
+
+    Beside a body that has come too near, all candidates touch its margins at once, and
+    nothing tells braking in the lane from steering into it.
+    """
+    x = motion_of(candidates.trajectory)
+    xp = namespace(x.s, scene.path.l)
+    bare = dataclasses.replace(
+        config, margin_along=0.0, margin_growth=0.0, margin_across=0.05
+    )
+    body = first_contact(scene, x, bare)
+    crossed = xp.any(_crossings(scene, x, config), axis=0)
+    line = xp.min(xp.where(crossed, TIMES_S[:, None], xp.inf), axis=0)
+    # m/s; a metre aside counts as much as 5 m of way
+    swerves = 0.5 * xp.abs(x.l[-1] - x.l[0])
+    return verdict._replace(
+        contact_s=xp.minimum(body, line), contact_v=verdict.contact_v + swerves
+    )
+
+
 def choose(
     verdict: Verdict, candidates: Candidates, scores: Array
 ) -> tuple[Array, Array]:

@@ -66,6 +66,8 @@ class ReplayedDrive:
     red: list[list[int]]  # [I] numbers of the lines that demand a stop
     # [I] flat quadruples: slot, s, l, heading
     agents: list[list[float]]
+    # m, offset of the path that it planned itself, on the road's grid; empty: the given
+    path_l: list[float]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -175,7 +177,20 @@ def thin(
         plan=plans or [[] for _ in steps],
         red=[np.flatnonzero(red[step]).tolist() for step in steps],
         agents=[_agents(case, record, shot, int(step)) for step in steps],
+        path_l=_own_path(record, shot, last),
     )
+
+
+def _own_path(record: Record, shot: Snapshot, last: int) -> list[float]:
+    """Offsets m of a drive's own path on the road's grid; [] if the path was given.
+
+    What was driven up to the step `last`, then what was planned in it.
+    """
+    if shot.plan_l is None:
+        return []
+    s = np.append(record.s[: last + 1], shot.plan_s[last, 1:])
+    l = np.append(record.l[: last + 1], shot.plan_l[last, 1:])
+    return _rounded(np.interp(np.arange(0.0, s.max(), ROAD_STEP_M), s, l), 2)
 
 
 def _rounded(values: ArrayLike, digits: int) -> list[float]:

@@ -16,6 +16,10 @@ function along(values, s) {
   return mix(values[i], values[i + 1], u - i);
 }
 
+function pathOf(drive) {
+  return drive.path_l.length > 1 ? drive.path_l : current.path_l;
+}
+
 function world(s, l) {
   const end = (current.x.length - 1) * current.road_step;
   const beyond = s - Math.min(Math.max(s, 0), end);
@@ -140,7 +144,7 @@ function birdsEye(canvas, drive) {
   pen.fill();
   for (const edge of current.edges) line(pen, ribbon(edge), INK, 1.5);
   for (const mark of current.marks) line(pen, ribbon(mark), PALE, 1, [8, 6]);
-  line(pen, ribbon(current.path_l), drive.look.colour, 1, [2, 4]);
+  line(pen, ribbon(pathOf(drive)), drive.look.colour, 1, [2, 4]);
   current.lines.forEach((s, number) => {
     if (s < -1000) return;
     const a = place(s, left), b = place(s, right);
@@ -180,7 +184,7 @@ function stationTime(canvas, drive, now) {
     for (const [slot, [s, l, heading]] of agentsAt(drive, i)) {
       const [kind, long, broad] = current.bodies[slot];
       const c = Math.abs(Math.cos(heading)), n = Math.abs(Math.sin(heading));
-      const beside = Math.abs(l - along(current.path_l, s)) - 0.5 * (long * n + broad * c);
+      const beside = Math.abs(l - along(pathOf(drive), s)) - 0.5 * (long * n + broad * c);
       if (beside - 0.5 * current.ego[1] >= IN_PATH_M) continue;
       const half = 0.5 * (long * c + broad * n);
       pen.globalAlpha = 0.55;
