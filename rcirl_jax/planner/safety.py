@@ -167,8 +167,7 @@ def check(
     body = first_contact(scene, x, config)
     line = xp.where(_crossings(scene, x, config), TIMES_S[:, None], xp.inf)
     margin, keeps = _rss(scene, x, config)
-    moment = xp.clip(xp.round(body / DT_S), 0, x.v.shape[0] - 1).astype("int32")
-    speed = xp.take_along_axis(x.v, moment[None], axis=0)[0]
+    speed = _speed_at(x, body)
     clear = xp.isinf(body) & xp.isinf(xp.min(line, axis=(0, 1)))
     admissible = candidates.feasible & clear
     if config.track != "collision":
@@ -181,9 +180,17 @@ def check(
     return Verdict(
         admissible=admissible,
         contact_s=body,
-        contact_v=xp.where(xp.isfinite(body), speed, 0.0),
+        contact_v=speed,
         rss_margin=xp.min(margin, axis=0),
     )
+
+
+def _speed_at(x: Motion, time: Array) -> Array:
+    """Speed [K] m/s at a time [K] s of each; 0 at none (inf)."""
+    xp = namespace(x.v, time)
+    moment = xp.clip(xp.round(time / DT_S), 0, x.v.shape[0] - 1).astype("int32")
+    speed = xp.take_along_axis(x.v, moment[None], axis=0)[0]
+    return xp.where(xp.isfinite(time), speed, 0.0)
 
 
 def explain(
@@ -260,11 +267,10 @@ def last_resort(
     body = first_contact(scene, x, bare)
     crossed = xp.any(_crossings(scene, x, config), axis=0)
     line = xp.min(xp.where(crossed, TIMES_S[:, None], xp.inf), axis=0)
+    meets = xp.minimum(body, line)
     # m/s; a metre aside counts as much as 5 m of way
     swerves = 0.5 * xp.abs(x.l[-1] - x.l[0])
-    return verdict._replace(
-        contact_s=xp.minimum(body, line), contact_v=verdict.contact_v + swerves
-    )
+    return verdict._replace(contact_s=meets, contact_v=_speed_at(x, meets) + swerves)
 
 
 def choose(

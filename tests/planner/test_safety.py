@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.planner.rank import ONLINE
+from rcirl_jax.planner.rank import ONLINE, ONLINE_PATHS
 from rcirl_jax.planner.safety import (
     Reason,
     SafetyConfig,
@@ -17,6 +17,7 @@ from rcirl_jax.planner.safety import (
     choose,
     explain,
     first_contact,
+    last_resort,
     motion_of,
 )
 from rcirl_jax.sampling.kinematics import (
@@ -288,3 +289,24 @@ def test_room_is_kept_before_what_never_moves():
     assert np.asarray(ENTRY(made, halts).admissible).tolist() == [False, True]
     near = with_obstacle(Kind.STATIC, 10.0, 0.0, v=0.0)
     assert bool(ENTRY(near, straight(near, 0.0)).admissible[0])
+
+
+def test_in_need_the_ego_brakes_beside_a_body_and_not_into_it():
+    """0.1 m beside a cyclist: all touch its margins at once; braking is left."""
+    made = with_obstacle(
+        Kind.CYCLIST, 1.0, -1.6, v=8.0, speed=5.0, length=1.8, width=1.0
+    )
+    made = jax.tree.map(jnp.asarray, made)
+    candidates = sampled(jax.random.key(0), made, ONLINE_PATHS)
+    verdict = ENTRY(made, candidates)
+    assert not np.asarray(verdict.admissible).any()
+    there = jax.jit(last_resort, static_argnums=3)
+    need = there(made, candidates, verdict, SafetyConfig(entry=True))
+    index, _ = choose(need, candidates, jnp.zeros_like(need.contact_s))
+    assert np.isinf(need.contact_s[index])
+    assert np.abs(candidates.trajectory.l[index]).max() < 0.05
+    assert float(candidates.trajectory.v[index, -1]) < 0.5
+    red = with_obstacle(Kind.STOP, 14.0, 0.0, v=8.0, length=0.1, width=40.0)
+    need = there(red, candidates, ENTRY(red, candidates), SafetyConfig(entry=True))
+    rolls = np.asarray(candidates.trajectory.s[:, -1]) > 20.0
+    assert np.isfinite(np.asarray(need.contact_s)[rolls]).all()

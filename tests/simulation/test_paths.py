@@ -7,13 +7,18 @@ import pytest
 
 from benchmarks.common import untrained
 from rcirl_jax.errors import InputError
+from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.features import feature_map
 from rcirl_jax.planner.rank import ONLINE_PATHS, RankConfig
 from rcirl_jax.planner.safety import SafetyConfig
+from rcirl_jax.reward.speed_dp import SPEED_DP_ROW
 from rcirl_jax.simulation.cases import EgoState
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases, first_scenes
 from rcirl_jax.simulation.rows import baseline_row
 from rcirl_jax.simulation.world import Vehicle, drive, lane_centre
+from rcirl_jax.simulators.drive import Driver
 from rcirl_jax.units import STATION_STEP_M
+from tests.helpers.own_planner import drawn_reward
 from tests.simulation.drives import constant, stack
 from tests.simulation.drives import drive as drive_all
 from tests.simulation.worlds import make_case
@@ -102,3 +107,18 @@ def test_drivers_in_turn_plan_alike():
     both = (ROW.policy, ROW.params), (constant, jnp.float32(0.0))
     with pytest.raises(InputError, match="takeover: one plans paths"):
         drive_cases(*both[0], stack([road()]), RolloutConfig(steps=5), takeover=both[1])
+
+
+def test_weights_plan_what_they_were_trained_to_plan(tmp_path):
+    """Beside them hand-set does too, unless it is told; the speed DP knows no paths."""
+    columns = feature_map("paper21")
+    reward = drawn_reward(tmp_path / "w.msgpack", columns, mode="path_speed")
+    asked = [str(tmp_path / "w.msgpack")], ["hand-set", SPEED_DP_ROW, "IDM"]
+    steers = lambda **how: [row.steers for row in table_rows(*asked, **how)]  # noqa: E731
+    assert reward.mode == "path_speed"
+    assert steers() == [True, True, False, False]
+    assert steers(mode="speed") == [True, False, False, False]
+    with pytest.raises(InputError, match=r"dp: .*mode: path_speed: expected speed"):
+        table_rows(*asked, dp=True)
+    with pytest.raises(InputError, match=r"mode: path_speed: .* in other simulators"):
+        Driver(ROW, [0])
