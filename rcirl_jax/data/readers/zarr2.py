@@ -68,7 +68,7 @@ class StructuredArray:
         meta = checked(body, _Metadata, file)
         (self.size,), (self.chunk,) = meta.shape, meta.chunks
         self.dtype = _dtype(file, meta.dtype)
-        known = self.dtype.fields or {}
+        known: Any = self.dtype.fields or {}
         for name, (kinds, shape) in fields.items():
             found = known[name][0] if name in known else None
             if found is None or found.base.kind not in kinds or found.shape != shape:
@@ -76,7 +76,7 @@ class StructuredArray:
                     f"{file}: dtype: {name}: {found or 'missing'}: expected shape "
                     f"{shape}, kind {' or '.join(kinds)}, among {', '.join(known)}"
                 )
-        self._texts = [name for name in fields if self.dtype[name].base.kind == "U"]
+        self._texts = [name for name in fields if known[name][0].base.kind == "U"]
         most = MAX_CHUNK_BYTES // self.dtype.itemsize
         if not 1 <= self.chunk <= most:
             raise InputError(f"{file}: chunks: {self.chunk}: expected 1 to {most}")

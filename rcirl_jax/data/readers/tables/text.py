@@ -181,7 +181,8 @@ def _options(path: Path, section: Mapping) -> dict[str, Any]:
     checked(section, _Options, f"{path}: table")
     found = dict(section)
     if "delimiter" in found:
-        mark = DELIMITERS.get(found["delimiter"], found["delimiter"])
+        given = str(found["delimiter"])
+        mark = DELIMITERS.get(given, given)
         if len(mark) != 1 or mark not in string.punctuation + " \t":
             expected = f"one of {', '.join(DELIMITERS)}, or a mark"
             raise InputError(f"{path}: table.delimiter: {mark}: expected {expected}")
