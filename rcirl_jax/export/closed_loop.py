@@ -416,6 +416,11 @@ def gate_job(
       InputError: a duration, suite or count that cannot be.
     """
     duration, own = case_duration(suite, duration_s), ""
+    if is_place(candidate):
+        raise InputError(
+            f"candidate: {candidate}: expected a weights file, or planner:COMMAND; an "
+            "own cost is the incumbent"
+        )
     if is_place(incumbent):
         own = incumbent
         incumbent = checked_own_cost(own).name
@@ -424,7 +429,8 @@ def gate_job(
     for place in planners.values():
         checked_program(place)
     learned = not own and incumbent not in (*BASELINES, *planners.values())
-    if learned and not Path(incumbent).is_file():
+    is_code = Path(incumbent).suffix in (".py", ".c", ".cc", ".cpp")
+    if learned and (is_code or not Path(incumbent).is_file()):
         raise InputError(
             f"incumbent: {incumbent}: expected a weights file, FILE.py:FUNCTION or "
             f"FILE.so of an own cost, planner:COMMAND, or one of "

@@ -162,7 +162,8 @@ def own_cost_of(rewards: Sequence[Reward], place: str = "") -> OwnCost | None:
         found[made.place] = made
     if len(found) > 1:
         raise InputError(
-            f"own cost: {', '.join(found)}: expected one for all rows of a table"
+            f"own cost: {', '.join(found)}: expected one for all rows of a table: a "
+            "weights file is compared with the own cost that it was tuned on"
         )
     return next(iter(found.values()), None)
 

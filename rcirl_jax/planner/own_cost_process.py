@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.answering import packed, unpacked
 from rcirl_jax.runtime.user_code import python_object
 from rcirl_jax.units import STATION_STEP_M, TIMES_S
@@ -69,9 +70,14 @@ def library_cost(path: str) -> Callable[[Any, Any], np.ndarray]:
     library = ctypes.CDLL(os.path.abspath(path))
     for name in ("rcirl_cost_abi", "rcirl_cost"):
         if not hasattr(library, name):
-            raise ValueError(f"{name}: missing: expected the functions of cost_abi.h")
+            raise InputError(
+                f"{name}: missing in the library: expected both functions of "
+                'cost_abi.h, in C++ as extern "C"'
+            )
     if (found := library.rcirl_cost_abi()) != ABI:
-        raise ValueError(f"rcirl_cost_abi: {found}: expected {ABI}")
+        raise InputError(
+            f"rcirl_cost_abi: {found}: expected {ABI}; compile it with this cost_abi.h"
+        )
 
     def cost(scene: Any, candidates: Any) -> np.ndarray:  # noqa: ANN401
         kept = []  # arrays that pointers point into
@@ -110,7 +116,7 @@ def library_cost(path: str) -> Callable[[Any, Any], np.ndarray]:
         costs = (ctypes.c_double * count)(*[float("nan")] * count)
         status = library.rcirl_cost(ctypes.byref(given), ctypes.byref(chosen), costs)
         if status:
-            raise ValueError(f"rcirl_cost: status {status}: expected 0")
+            raise InputError(f"rcirl_cost: it returned {status}: expected 0")
         return np.array(costs)
 
     return cost
@@ -146,7 +152,8 @@ def main() -> None:
             costs = [np.asarray(cost(x.scene, x.candidates), float) for x in each]
             made = {"costs": np.stack(costs) if costs else np.zeros(0)}
         except Exception as error:
-            made = {"wrong": np.array(f"{type(error).__name__}: {error}")}
+            kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+            made = {"wrong": np.array(f"{kind}{error}")}
         answers.write(packed(made))
         answers.flush()
 

@@ -5,6 +5,8 @@ Knows nothing of JAX, so that processes that need it start at once.
 
 import hashlib
 import importlib.util
+import sys
+import types
 from pathlib import Path
 from typing import Any
 
@@ -38,12 +40,18 @@ def python_sha256(place: str, what: str) -> str:
 
 
 def python_object(place: str) -> Any:  # noqa: ANN401
-    """Imports the file of a place, and returns what bears its name."""
-    file, _, name = place.partition(".py:")
-    spec = importlib.util.spec_from_file_location(Path(file).name, python_file(place))
+    """Imports the file of a place, and returns what bears its name.
+
+    The file may import its neighbours, which come after all that is installed.
+    """
+    file, name = python_file(place).resolve(), place.partition(".py:")[2]
+    spec = importlib.util.spec_from_file_location(str(file), file)
     if spec is None or spec.loader is None:
-        raise ValueError(f"{python_file(place)}: expected a Python file")
+        raise ValueError(f"{file}: expected a Python file")
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look up their module there
+    if str(file.parent) not in sys.path:
+        sys.path.append(str(file.parent))
     spec.loader.exec_module(module)
     return getattr(module, name)
 
@@ -67,9 +75,14 @@ def loaded(place: str, what: str) -> Any:  # noqa: ANN401
     except Exception as error:
         name = place.partition(".py:")[2]
         if isinstance(error, AttributeError) and error.name == name:
-            known = [one for one in dir(error.obj) if not one.startswith("_")]
+            known = [
+                one
+                for one, value in vars(error.obj).items()
+                if not one.startswith("_") and not isinstance(value, types.ModuleType)
+            ]
             raise InputError(
-                f"{place}: expected a name of that file" + did_you_mean(name, known)
+                f"{place}: expected a name of that file: {', '.join(known) or 'none'}"
+                + did_you_mean(name, known)
             ) from error
         raise InputError(
             f"{place}: {type(error).__name__}: {error}: expected a file that Python "

@@ -1,5 +1,6 @@
 """A planner's own cost: of JAX, numpy and C the same; what is none is one line."""
 
+import sys
 from pathlib import Path
 
 import jax
@@ -12,6 +13,7 @@ from rcirl_jax.export.closed_loop import checked_own_cost
 from rcirl_jax.planner import own_cost as module
 from rcirl_jax.planner.own_cost import OwnCost, check_own_cost, own_cost
 from rcirl_jax.planner.rank import ONLINE, RankConfig, rank_policy
+from rcirl_jax.runtime.user_code import python_object
 from rcirl_jax.sampling import sample
 from rcirl_jax.simulation.rollout import first_scenes
 from rcirl_jax.simulation.rows import Row, baseline_row
@@ -119,6 +121,29 @@ def test_what_is_no_cost_is_one_line(name, line, some, monkeypatch):
 def test_what_is_not_there_is_one_line(given, line):
     with pytest.raises(InputError, match=line):
         own_cost(given)
+
+
+def test_a_file_may_import_its_neighbours_and_have_dataclasses(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "weights_of_mine.py").write_text("JERK = 0.5\n")
+    (tmp_path / "cost.py").write_text(
+        "from __future__ import annotations\n"
+        "import dataclasses\n"
+        "from weights_of_mine import JERK\n"
+        "@dataclasses.dataclass\n"
+        "class Mine:\n"
+        "    jerk: float = JERK\n"
+        "def my_cost(scene, candidates):\n"
+        "    return Mine().jerk * candidates\n"
+    )
+    assert python_object(f"{tmp_path / 'cost.py'}:my_cost")(None, 4.0) == 2.0
+
+
+def test_a_library_without_the_functions(tmp_path, some):
+    (tmp_path / "none.cpp").write_text("int rcirl_cost_abi() { return 1; }")
+    file = compiled(tmp_path / "none.cpp", tmp_path / "libmine.so", "-shared", "-fPIC")
+    with pytest.raises(InputError, match=r'rcirl_cost_abi: missing .* extern "C": '):
+        check_own_cost(own_cost(str(file)), *some)
 
 
 def test_a_library_that_is_none(tmp_path, some):
