@@ -184,7 +184,7 @@ def test_terms_that_have_changed_are_refused(tmp_path):
     ("text", "line"),
     [
         ("TERMS = {'a': (len, 0.0)}", "a: weight 0.0: expected a number above 0"),
-        ("TERMS = {'a': (len, 'x')}", "a: weight x: expected a number above 0"),
+        ("TERMS = {'a': (len, 'x')}", "a: weight 'x': expected a number above 0"),
         ("TERMS = [1]", "list: expected {name: [(]term, weight"),
         ("TERMS = {'a': len}", "a: <built-in"),
         ("TERM = {}", "expected a name of that file; did you mean TERM"),
