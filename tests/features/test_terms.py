@@ -187,7 +187,7 @@ def test_terms_that_have_changed_are_refused(tmp_path):
         ("TERMS = {'a': (len, 'x')}", "a: weight 'x': expected a number above 0"),
         ("TERMS = [1]", "list: expected {name: [(]term, weight"),
         ("TERMS = {'a': len}", "a: <built-in"),
-        ("TERM = {}", "expected a name of that file; did you mean TERM"),
+        ("TERM = {}", "expected a name of that file: TERM; did you mean TERM"),
         ("import nothing_there", "ModuleNotFoundError"),
     ],
 )
