@@ -143,7 +143,7 @@ def _terms(place: str) -> Mapping[str, tuple[Term, float]]:
         weight = pair[1]
         if not isinstance(weight, int | float) or not 0.0 < weight < math.inf:
             raise InputError(
-                f"{place}: {name}: weight {weight!r}: expected a number above 0, as the "
-                "planner drives today; of a new term a small one"
+                f"{place}: {name}: weight {weight!r}: expected a number above 0, as "
+                "the planner drives today; of a new term a small one"
             )
     return found
