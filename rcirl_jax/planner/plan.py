@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap
+from jax.typing import ArrayLike
 
 from rcirl_jax.geometry.frenet import lookup
 from rcirl_jax.geometry.polynomial import hermite
@@ -149,7 +150,7 @@ def stations_from_now(plan: Plan) -> jax.Array:
     return stations[:-1] - stations[-1]
 
 
-def path_at(plan: Plan, after: jax.Array | float) -> jax.Array:
+def path_at(plan: Plan, after: ArrayLike) -> jax.Array:
     """Offset m, dl and ddl 1/m [3, ...] of a plan's path some seconds [...] from now.
 
     Offsets by cubic Hermite interpolation between the planned times, the rest linearly;

@@ -10,7 +10,7 @@ for constant speed and the emergency stops, which the safety filter needs.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -223,6 +223,7 @@ def sample(key: jax.Array, scene: Scene, config: SamplerConfig) -> Candidates:
     with jax.named_scope("sampling"):
         stations = speed_profiles(key, scene, config)
         family = jnp.asarray(_speed_families(config))
+        keeps = True
         if config.mode == "speed":
             trajectory = jax.vmap(trajectory_on_path, in_axes=(None, 0))(
                 scene, stations
@@ -241,11 +242,9 @@ def sample(key: jax.Array, scene: Scene, config: SamplerConfig) -> Candidates:
             )
             family = family[which_speed]
             allowed = moves.allowed > 0.0
+            keeps = which_lateral < 2  # the others swerve as hard as they brake
         inside = jax.vmap(lambda x: within_limits(scene, x, config))(trajectory)
-        is_emergency = family == family_index("emergency")
-        if config.mode != "speed" and not config.own:
-            # the others swerve as hard as they brake
-            is_emergency = is_emergency & (which_lateral < 2)
+        is_emergency = (family == family_index("emergency")) & keeps
         if config.own:
             allowed = _begins(scene, stations, config) | is_emergency
         return Candidates(
@@ -608,8 +607,9 @@ def lateral_moves(scene: Scene, config: SamplerConfig) -> Moves:
     targets += [ego.l + offset for offset in config.nudge_offsets]
     times += [slow] * len(config.nudge_offsets)
     count = len(targets)
-    least, longest = [config.min_lateral_length] * count, [jnp.inf] * count
-    back = [jnp.inf] * count
+    least: list[Any] = [config.min_lateral_length] * count
+    longest: list[Any] = [jnp.inf] * count
+    back: list[Any] = [jnp.inf] * count
     if config.pass_gap:
         sides, begin, end = _in_front(scene, centre)
         clear = 0.5 * ego.width + config.pass_gap
@@ -619,7 +619,7 @@ def lateral_moves(scene: Scene, config: SamplerConfig) -> Moves:
             least.append(0.0)
             longest.append(begin - ego.s)
             back.append(end)
-    target, seconds, least, longest, back = (
+    target, seconds, shortest, most, back_at = (
         jnp.stack([jnp.asarray(value, jnp.float32) for value in values])
         for values in (targets, times, least, longest, back)
     )
@@ -629,12 +629,12 @@ def lateral_moves(scene: Scene, config: SamplerConfig) -> Moves:
         1.25 / config.max_curvature, 2.0 * ego.v**2 / config.max_lateral_acceleration
     )
     bend = MOVE_CURVATURE * bend * jnp.abs(target - ego.l)
-    shortest = jnp.maximum(least, jnp.sqrt(bend))
-    longest = jnp.maximum(longest, shortest)
+    shortest = jnp.maximum(shortest, jnp.sqrt(bend))
+    most = jnp.maximum(most, shortest)
     inside = (target >= road[0]) & (target <= road[1])
     free = jnp.arange(target.size) < 1 + len(config.lateral_times)
     allowed = (inside | free).astype(jnp.float32)
-    return Moves(target, seconds, shortest, longest, back, allowed)
+    return Moves(target, seconds, shortest, most, back_at, allowed)
 
 
 def _in_front(
@@ -664,9 +664,8 @@ def _in_front(
     last = jnp.max(jnp.where(group, upper, -jnp.inf)) + half + PAST_M
     found = jnp.any(group)
     # infinite numbers would make the curves NaN
-    sides = tuple(jnp.where(found, side, 1e3) for side in sides)
-    begin = jnp.where(found, first - half, 1e3)
-    return sides, begin, jnp.where(found & ~moves, last, jnp.inf)
+    begin, right, left = (jnp.where(found, x, 1e3) for x in (first - half, *sides))
+    return (right, left), begin, jnp.where(found & ~moves, last, jnp.inf)
 
 
 def lateral_offset(

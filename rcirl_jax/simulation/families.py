@@ -39,7 +39,7 @@ class Parts:
     kappa: np.ndarray
     limits: list[tuple[float, float]]
     shifts: list[tuple[float, float, float]]
-    routes: list[tuple[float, float, float, float]]  # m, m, first and last lane
+    routes: list[tuple[float, ...]]  # m, m, first and last lane
     lines: list[dict[str, float]]
     agents: list[dict]
 

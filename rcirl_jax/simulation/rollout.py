@@ -225,13 +225,14 @@ def _compiled(policy: Policy, plan_every: int, length: int, vehicle: Vehicle) ->
         def plan_and_drive(now: Now, _: None) -> tuple[Now, jax.Array]:
             see = functools.partial(observe, steers=steers)
             scenes = jax.vmap(see)(cases, now.worlds, limits)
-            plans = now.plan
+            plan = jax.vmap(plan_of)
             if steers:  # a scene's offsets are from the middle of a lane
                 middle = jax.vmap(lane_centre)(cases.road, now.worlds.ego)
-                plans = jax.vmap(beside)(plans, middle)
-            plans = jax.vmap(plan_of)(scenes, keys, now.worlds, plans, cases.seed)
-            if steers:
+                before = jax.vmap(beside)(now.plan, middle)
+                plans = plan(scenes, keys, now.worlds, before, cases.seed)
                 plans = jax.vmap(beside)(plans, -middle)
+            else:
+                plans = plan(scenes, keys, now.worlds, now.plan, cases.seed)
             now = now.replace(plan=plans)
             drive = jax.vmap(tick, in_axes=(0, None, 0))
             return jax.lax.scan(
@@ -311,19 +312,15 @@ def plans_along(
     """
     cases, length = _completed(cases), config.span
     program = _compiled(policy, config.plan_every, length, config.vehicle)
-    manner = config.manner()
-    now, limits = _begin(cases)
+    manner, steers = config.manner(), _steers(policy)
+    now, limits = _begin(cases, steers)
     stations, lasts = [], []
     for at in range(0, config.steps, length):
         if at % config.frames_every == 0:
             long_ago = jnp.full_like(now.plan.since_choice, math.inf)
             due = now.replace(plan=now.plan.replace(since_choice=long_ago))
-            seen = [
-                _unpacked(
-                    np.asarray(program(x, cases, manner, limits, due)[1])[0], cases
-                )
-                for x in params
-            ]
+            made = [program(x, cases, manner, limits, due)[1] for x in params]
+            seen = [_unpacked(np.asarray(x)[0], cases, steers) for x in made]
             stations.append([shot.plan_s for _, shot in seen])
             lasts.append(seen[0][0].valid)
         now, _ = program(params[0], cases, manner, limits, now)

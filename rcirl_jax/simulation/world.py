@@ -437,8 +437,8 @@ def observe(case: Case, world: World, limit: jax.Array, steers: bool = False) ->
     kappa = lookup(road.kappa, ego.s, ROAD_STEP_M)
     shrink = jnp.maximum(1.0 - kappa * ego.l, 0.1)
     flat = jnp.ones((NUM_STATIONS,))
+    middle = lane_centre(road, ego) if steers else jnp.zeros(())
     if steers:
-        middle = lane_centre(road, ego)
         ego = ego.replace(l=ego.l - middle)
         kappa = kappa / jnp.maximum(1.0 - kappa * middle, 0.1)
         bend = _window(road.kappa, ego.s)
