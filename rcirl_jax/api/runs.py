@@ -240,7 +240,7 @@ def tune(
     suite: str = "full",
     cases: int | None = None,
     duration_s: float | None = None,
-    drives: int = 240,
+    drives: int = DRIVES,
     executor: Executor | None = None,
     **settings: Any,  # noqa: ANN401
 ) -> Verdict:

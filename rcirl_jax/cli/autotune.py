@@ -24,6 +24,7 @@ from rcirl_jax.data.formats import IMPORTERS
 from rcirl_jax.data.formats.recognise import recognised_format
 from rcirl_jax.data.importing import ImportConfig, Logs
 from rcirl_jax.errors import InputError, did_you_mean
+from rcirl_jax.evaluation.gate.types import DRIVES
 from rcirl_jax.export.closed_loop import write_own_terms
 from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.train.loop import Running
@@ -66,9 +67,9 @@ _EXPERT = flags.DEFINE_enum(
 )
 _DRIVES = flags.DEFINE_integer(
     "drives",
-    240,
-    "held-out drives that measure nearness to the human, 1 or more: the more, the "
-    "narrower the interval",
+    DRIVES,
+    "held-out drives that measure nearness to the human and safety among recorded "
+    "traffic, 1 or more; by default all, up to that many",
 )
 _PARALLEL = flags.DEFINE_enum(
     "parallel", "auto", PARALLEL, "how devices share a batch: auto takes all of them"

@@ -506,6 +506,8 @@ def margins() -> Callable[[], GateConfig]:
         "progress": "of the incumbent's progress",
         "family_progress": "of its progress in one family",
         "likeness": "farther from the human, share of the incumbent's distance",
+        "recorded": "vehicles of held-out drives with more of a fault, share",
+        "headway": "more time with a headway below 1 s on held-out drives, share",
         "gain": "of one primary metric, whatever is gained in another",
     }
     numbers = {

@@ -95,7 +95,14 @@ DECISIONS = {  # classes of the decisions
 }
 SAFETY = {"fail": "refused", "open": "open"}  # of the card, by the worst outcome
 # families have a section of their own
-KINDS = ("safety", "no loss", "trivial baselines", "likeness", "gain")
+KINDS = (
+    "safety",
+    "recorded traffic",
+    "no loss",
+    "trivial baselines",
+    "likeness",
+    "gain",
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,6 @@ which does not grow with the work, counts in neither.
 """
 
 import dataclasses
-import itertools
 import shlex
 import textwrap
 import time
@@ -18,7 +17,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from rcirl_jax.data.importing import Logs
 from rcirl_jax.data.store.dataset import Dataset, Demonstrations, shares_of
 from rcirl_jax.errors import InputError, extra_of
-from rcirl_jax.evaluation.gate.types import CANDIDATE, Verdict
+from rcirl_jax.evaluation.closed_loop.likeness import read_arrays
+from rcirl_jax.evaluation.gate.types import CANDIDATE, DRIVES, Verdict
 from rcirl_jax.evaluation.gate.words import WIDTH
 from rcirl_jax.export.closed_loop import SuiteJob, checked_sampler
 from rcirl_jax.export.forms import terms_table
@@ -169,8 +169,9 @@ def _ending(
     """
     lines = ["", f"verdict: {verdict.decision.upper()}"]
     lines += textwrap.wrap(verdict.sentence, WIDTH)
-    for said in itertools.chain(*warned.values()):
-        lines += textwrap.wrap(f"warning: {said}", WIDTH)
+    if count := sum(map(len, warned.values())):
+        where = ", ".join(warned)
+        lines.append(f"warnings: {count}, said above and in the report: {where}")
     lines += [f"weights: {run.weights}", f"all tables: {run.tables}"]
     lines += [page] if page else []
     case = (*verdict.look_at, first)[0]
@@ -179,10 +180,12 @@ def _ending(
     if page.startswith(NO_REPORT):
         step = f"install it, then rcirl report --run={folder}"
     if verdict.part and verdict.decision == "could not judge":
-        usual = {"suite": "full", "cases": None, "duration_s": None, "drives": 240}
+        usual = {"suite": "full", "cases": None, "duration_s": None, "drives": DRIVES}
         config = dataclasses.replace(run.config, **usual)
         job, _ = suite_job(dataclasses.replace(run, config=config))
-        driven = len(job.refs) * job.duration_s + config.drives * DRIVE_S
+        there = read_arrays(run.folder / "likeness.npz").available
+        drives = min(config.drives, there)
+        driven = len(job.refs) * job.duration_s + drives * DRIVE_S
         lines.append(
             "for a verdict that can ship: the same command without --suite, --cases, "
             "--duration and --drives, about "
@@ -254,7 +257,7 @@ def work_of(
     learned = TRAINED_S * counts["train"] * config.train.epochs
     cases = plan.cases + plan.rounds * plan.takeover_cases if plan.datasets else 0
     demonstrated = DRIVEN_S * len(suite_refs("full", 1)) * cases * plan.duration_s
-    recorded = config.drives * DRIVE_S
+    recorded = min(config.drives, counts["test"]) * DRIVE_S
     driven = len(job.refs) * job.duration_s + recorded
     settings, cases = dial_plan(job)
     some = len(cases) * job.duration_s + recorded  # s

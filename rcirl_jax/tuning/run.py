@@ -33,7 +33,7 @@ from typing import Any
 
 from rcirl_jax.data.store.dataset import EQUAL, Dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.gate.types import GateConfig
+from rcirl_jax.evaluation.gate.types import DRIVES, GateConfig
 from rcirl_jax.export.closed_loop import checked_own_cost
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import Reward
@@ -79,7 +79,7 @@ class TuneConfig:
     recipe: str = ""  # its name, for the report
     seeds: int = 1
     search: str = "cma"  # of the tuned IDM: one of `baselines.SEARCHES`
-    drives: int = 240  # held-out, for human-likeness
+    drives: int = DRIVES  # held-out, for human-likeness and safety
     horizon_s: float = 5.0
     suite: str = "full"
     cases: int | None = None  # per family

@@ -51,8 +51,9 @@ def test_a_small_loop(tmp_path):
         assert re.match(rf"stage {number} of 7: {name}; [\d hmins]+ so far", line), line
         assert number == 1 or line.endswith(" left, compiling not counted")
     *_, last = done.stdout.split("\n\n")
+    assert "\nwarning: training: " in done.stdout
     ending = last.splitlines()
-    assert len(ending) <= 9
+    assert len(ending) <= 10
     assert ending[0].startswith("verdict: ")
     assert f"report to open: {run}/report.html" in ending
     assert ending[-1].startswith(f"next: rcirl replay --weights={run}/weights.msgpack ")
@@ -61,7 +62,8 @@ def test_a_small_loop(tmp_path):
     stages = [
         "import 0", "demonstrate 0", "prior cost 1", "demonstrate learner 1",
         "demonstrate 1", "prior cost 2", "train 0", "export", "tune", "rank predicted",
-        "rank recorded", "simulate", "likeness", "gate", "dial", "report",
+        "rank recorded", "simulate", "likeness", "gate", "dial", "decided",
+        "report",
     ]  # fmt: skip
     assert kept(done) == dict.fromkeys(stages, False)
     verdict = json.loads((run / "verdict.json").read_text())

@@ -1,15 +1,20 @@
 """Stored scenes driven in closed loop: the human comes back, and draws are even."""
 
+import types
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.closed_loop import likeness
 from rcirl_jax.evaluation.closed_loop.likeness import (
+    TRAFFIC,
     held_out_likeness,
     jensen_shannon,
     read_arrays,
+    traffic_of,
     write_arrays,
 )
 from rcirl_jax.evaluation.gate.types import Likeness
@@ -153,7 +158,7 @@ def test_a_turning_body_has_the_size_that_it_has_along_an_axis():
         assert float(case.agents.width[0]) == pytest.approx(2.5, abs=0.1)
 
 
-def test_distances_are_those_of_the_drives(tmp_path):
+def test_distances_are_those_of_the_drives(tmp_path, monkeypatch):
     """Coasting against a human who brakes at 0.2 m/s^2.
 
     The ego starts with the human's braking, which fades with the drive train's lag of
@@ -182,6 +187,12 @@ def test_distances_are_those_of_the_drives(tmp_path):
     assert isinstance(back, Likeness)
     np.testing.assert_array_equal(back.distance["coast"], coasted.distance)
     assert back.available == 3
+    for name, row in report.rows.items():
+        assert back.traffic[name].keys() == row.traffic.keys()
+        assert not np.any([*back.traffic[name].values()])  # nobody else was recorded
+    monkeypatch.setattr(likeness, "CHUNK", 2)
+    again = held_out_likeness(drives, rows)
+    np.testing.assert_array_equal(again.distance["coast"], coasted.distance)
     with pytest.raises(InputError, match=r"none\.npz"):
         read_arrays(tmp_path / "none.npz")
 
@@ -196,11 +207,13 @@ def test_distances_are_those_of_the_drives(tmp_path):
         ("distance", -np.ones((2, 3)), "distance: below 0, NaN or infinity"),
         ("distance", None, "expected distances as written"),
         ("available", np.array(0.5), "available: float64 (), not ()"),
+        ("headway", np.full((1, 3), 2.0), "headway: not from 0 to 1"),
     ],
 )
 def test_damaged_distances_are_one_line(tmp_path, name, array, says):
     good = {"names": np.array(["a", "b"]), "distance": np.ones((2, 3))}
     good |= {"clusters": np.arange(3), "available": np.array(3)}
+    good |= {"drivers": np.array(["a"])} | {key: np.ones((1, 3)) for key in TRAFFIC}
     arrays = {**good, name: array}
     arrays = {n: x for n, x in arrays.items() if x is not None}
     path = tmp_path / "x.npz"
@@ -212,6 +225,25 @@ def test_damaged_distances_are_one_line(tmp_path, name, array, says):
     path.write_bytes(path.read_bytes()[:-30])
     with pytest.raises(InputError, match="expected distances as written"):
         read_arrays(path)
+
+
+def test_safety_counts_what_happens_before_a_crash():
+    """Two drives of 1 s: one comes close, then crashes; one ends before that."""
+    shape, late = (2, 10), np.arange(10) >= 6
+    record = types.SimpleNamespace(
+        valid=np.stack([np.arange(10) < 8, ~late]), at_fault=np.zeros(shape),
+        ttc=np.full(shape, 0.5), ttc_counts=np.stack([late, late]),
+        headway=np.where([late, ~late], 0.5, np.inf), v=np.full(shape, 5.0),
+        induced_braking=np.stack([5.0 * late, 3.0 + late]),
+    )  # fmt: skip
+    record.at_fault[0, 7] = 1
+    found = traffic_of(record, np.ones(shape, bool))
+    assert found["collision"].tolist() == [1.0, 0.0]
+    assert found["ttc"].tolist() == [1.0, 0.0]
+    assert found["braking"].tolist() == [1.0, 0.0]
+    assert found["headway"] == pytest.approx([0.2, 0.6])
+    record.v[:] = 0.5  # who hardly moves keeps no headway
+    assert traffic_of(record, np.ones(shape, bool))["headway"].tolist() == [0.0, 0.0]
 
 
 def test_jensen_shannon_of_known_samples():

@@ -99,7 +99,7 @@ def test_what_to_do_next_without_a_report_is_to_have_one(tmp_path):
 
     def last(page):
         said = loop._ending(run, verdict, page, "b@0", {"training": ["too short"]})
-        assert "\nwarning: too short\n" in said
+        assert "\nwarnings: 1, said above and in the report: training\n" in said
         return said.splitlines()[-1]
 
     assert "rcirl replay --weights=w --case=a@0" in last("report to open: r")

@@ -9,8 +9,8 @@ per drive: it has the unit of the ranking tables, needs no choice of features, a
 drive that crashes stays where it crashed, so no drive is dropped. Beside it, in the
 spirit of the Waymo sim-agents challenge (Montali et al. 2023, arXiv 2305.12032), how
 unlike the human's the distributions of acceleration, jerk, headway and time to
-collision are: the Jensen-Shannon distance of histograms over all drives, 0 to 1. Host
-numpy, float64.
+collision are: the Jensen-Shannon distance of histograms over all drives, 0 to 1. The
+gate also reads how safe the drives are (`TRAFFIC`). Host numpy, float64.
 """
 
 import dataclasses
@@ -40,6 +40,7 @@ from rcirl_jax.evaluation.statistics import (
 from rcirl_jax.planner.program import name_cases
 from rcirl_jax.runtime.executors import two_at_a_time
 from rcirl_jax.simulation.cases import STEP_S, Record
+from rcirl_jax.simulation.metrics import MetricsConfig
 from rcirl_jax.simulation.recorded import STEPS, HeldOut
 from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, firsts_first, human_row
@@ -54,6 +55,17 @@ HISTOGRAMS: dict[str, tuple[float, float, int]] = {
     "headway": (0.0, 8.0, 32),  # s; nobody ahead counts in the last bin
     "time_to_collision": (0.0, 20.0, 40),  # s; likewise
 }
+# safety among recorded traffic, by drive: field of `Driven` -> head of its column
+TRAFFIC = {
+    "collision": "at fault",  # drives with an at-fault collision
+    "ttc": f"TTC<{MetricsConfig.nuplan_ttc:g} s",  # drives with less to a collision
+    "braking": "others brake",  # drives in which the ego makes somebody brake hard
+    "headway": "headway<1 s",  # share of time
+}
+BRAKING_MPS2 = 4.0  # m/s^2, hard braking of others
+HEADWAY_S = 1.0  # s, short headway
+MOVING_MPS = 1.0  # m/s below which a headway says nothing
+CHUNK = 10 * LANES  # drives in memory at a time
 REFERENCES = ("hand-set", "IDM", "IDM, tuned", "+velocity", "constant V")
 
 
@@ -64,8 +76,7 @@ class Driven:
     distance: np.ndarray  # [D] m, see above
     at: np.ndarray  # [D, len(TIMES_SHOWN_S)] m; NaN where the record is shorter
     mean_speed: np.ndarray  # [D] m/s, over the same time as the human's
-    induced_braking: np.ndarray  # [D] m/s^2, hardest that the ego caused
-    crashed: np.ndarray  # [D] bool, at fault
+    traffic: Mapping[str, np.ndarray]  # of TRAFFIC, [D] each: 0, 1 or a share
     samples: Mapping[str, np.ndarray]  # of HISTOGRAMS, all drives' in one
     not_driven: int = 0  # drives in which a program gave no plan: it stands there
 
@@ -91,7 +102,10 @@ class LikenessReport:
     def likeness(self) -> Likeness:
         """The distances in the form that the gate reads."""
         return Likeness(
-            distance=self.distance, clusters=self.clusters, available=self.available
+            distance=self.distance,
+            clusters=self.clusters,
+            available=self.available,
+            traffic={name: row.traffic for name, row in self.rows.items()},
         )
 
     @functools.cached_property
@@ -119,8 +133,7 @@ class LikenessReport:
                     for key in HISTOGRAMS
                 },
                 "speed_share": float(np.mean(row.mean_speed) / human.mean_speed.mean()),
-                "induced_braking_mps2": float(np.mean(row.induced_braking)),
-                "crashed": int(np.sum(row.crashed)),
+                "traffic": {key: float(np.sum(x)) for key, x in row.traffic.items()},
                 "not_driven": row.not_driven,
                 "minus": {
                     other: dataclasses.asdict(
@@ -152,15 +165,21 @@ class LikenessReport:
                 *(f"{row['at_m'][t]:.2f}" if t in row["at_m"] else "" for t in times),
                 f"{100 * row['speed_share']:.0f} %",
                 *(f"{x:.2f}" for x in row["unlikeness"].values()),
-                f"{row['induced_braking_mps2']:.2f}",
-                str(row["crashed"]),
             ]
             for name, row in sorted(
                 facts["rows"].items(), key=lambda x: x[1]["distance_m"]["mean"]
             )
         ]
         head = ["row", "distance m", *(f"{t} s" for t in times), "speed", "a", "jerk"]
-        head += ["headway", "TTC", "induced", "crashes"]
+        head += ["headway", "TTC"]
+        safe = [
+            [
+                name,
+                *(f"{row['traffic'][key]:.0f}" for key in TRAFFIC if key != "headway"),
+                f"{100.0 * row['traffic']['headway'] / facts['drives']:.1f} %",
+            ]
+            for name, row in facts["rows"].items()
+        ]
         lines = [
             f"Distance to the human, held out: {facts['drives']} drives of "
             f"{facts['vehicles']} vehicles in {facts['recordings']} recordings",
@@ -172,6 +191,10 @@ class LikenessReport:
                 for name, row in self.rows.items()
                 if row.not_driven
             ),
+            "",
+            f"Safety among recorded traffic: of {facts['drives']} drives, or of time",
+            *text_table(["row", *TRAFFIC.values()], safe),
+            f"others brake: by more than {BRAKING_MPS2:g} m/s2, because of the ego",
             "",
         ]
         if known:
@@ -192,6 +215,12 @@ def write_arrays(path: Path, known: Likeness) -> None:
     table = np.array(list(known.distance.values()), np.float64)
     names = np.array(list(known.distance))
     arrays = {"names": names, "distance": table, "clusters": known.clusters}
+    drivers = list(known.traffic)
+    arrays |= {
+        key: np.array([known.traffic[name][key] for name in drivers], np.float64)
+        for key in TRAFFIC
+    }
+    arrays["drivers"] = np.array(drivers)
     write_npz(path, {**arrays, "available": np.array(known.available)})
 
 
@@ -210,10 +239,19 @@ def read_arrays(path: Path) -> Likeness:
         if not np.all((arrays["distance"] >= 0.0) & (arrays["distance"] < np.inf)):
             raise ValueError("distance: below 0, NaN or infinity")
         distance = dict(zip(names, arrays["distance"], strict=True))
+        drivers = names_of_rows(arrays["drivers"])
+        for key in TRAFFIC:
+            check_array(arrays, key, "f", (len(drivers), count))
+            if not np.all((arrays[key] >= 0.0) & (arrays[key] <= 1.0)):
+                raise ValueError(f"{key}: not from 0 to 1")
         return Likeness(
             distance=distance,
             clusters=arrays["clusters"],
             available=int(arrays["available"]),
+            traffic={
+                name: {key: arrays[key][i] for key in TRAFFIC}
+                for i, name in enumerate(drivers)
+            },
         )
 
 
@@ -286,27 +324,40 @@ def held_out_likeness(
 def _driven(row: Row, drives: HeldOut, plan_every: int = 1) -> Driven:
     """Drives one row and measures it against the humans of the cases."""
     count = len(drives.ids)
+    parts = [
+        _measured(row, drives, np.arange(first, min(first + CHUNK, count)), plan_every)
+        for first in range(0, count, CHUNK)
+    ]
+    lost = sum(x.not_driven for x in parts)
+    arrays = [{**vars(x), "not_driven": np.zeros(1)} for x in parts]
+    joined = jax.tree.map(lambda *x: np.concatenate(x), *arrays)
+    return Driven(**{**joined, "not_driven": lost})
+
+
+def _measured(row: Row, drives: HeldOut, at: np.ndarray, plan_every: int) -> Driven:
+    """Drives a row over the drives `at` [n] as `_driven` does."""
+    count = at.size
     fill = np.minimum(np.arange(-(-count // LANES) * LANES), count - 1)
-    cases = jax.tree.map(lambda x: np.asarray(x)[fill], drives.cases)
+    cases = jax.tree.map(lambda x: np.asarray(x)[at[fill]], drives.cases)
     config = rollout_config(row, HORIZON_S, plan_every)
     logs = drive_cases(row.policy, row.params, cases, config)
     # where plans are rarer, the last may end after the horizon
     record: Record = jax.tree.map(lambda x: np.asarray(x)[:count, :STEPS], logs[0])
     assert drives.cases.replay is not None
-    human = np.asarray(drives.cases.replay.ego_s, np.float64)[:, 1:]
+    human = np.asarray(drives.cases.replay.ego_s, np.float64)[at, 1:]
     lost = 0
     if row.program is not None:
         lost = int(np.sum(~np.isfinite(record.s).all(axis=1)))
         record = jax.tree.map(np.nan_to_num, record)
-    steps = np.asarray(drives.cases.steps)
-    lasts = np.arange(STEPS)[None] < steps[:, None]  # [D, S], crash or not
+    steps = np.asarray(drives.cases.steps)[at]
+    lasts = np.arange(STEPS)[None] < steps[:, None]  # [n, S], crash or not
     apart = np.abs(np.asarray(record.s, np.float64) - human)
     if not np.isfinite(apart[lasts]).all():
-        bad = drives.ids[int(np.argmax(~np.isfinite(apart).all(axis=1)))]
+        bad = drives.ids[at[int(np.argmax(~np.isfinite(apart).all(axis=1)))]]
         raise InputError(
             f"held-out drives: {row.name}: {bad}: station: expected a finite number"
         )
-    at = [
+    places = [
         np.where(steps >= round(t / STEP_S), apart[:, round(t / STEP_S) - 1], np.nan)
         for t in TIMES_SHOWN_S
     ]
@@ -315,10 +366,9 @@ def _driven(row: Row, drives: HeldOut, plan_every: int = 1) -> Driven:
     moves = lasts[:, 1:]
     return Driven(
         distance=mean(apart),
-        at=np.stack(at, axis=1),
+        at=np.stack(places, axis=1),
         mean_speed=mean(np.asarray(record.v, np.float64)),
-        induced_braking=np.where(lasts, record.induced_braking, 0.0).max(axis=1),
-        crashed=np.any(np.asarray(record.at_fault) > 0, axis=1),
+        traffic=traffic_of(record, lasts),
         samples={
             "acceleration": a[lasts],
             "jerk": (np.diff(a, axis=1) / STEP_S)[moves],
@@ -327,3 +377,25 @@ def _driven(row: Row, drives: HeldOut, plan_every: int = 1) -> Driven:
         },
         not_driven=lost,
     )
+
+
+def traffic_of(record: Record, lasts: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns the safety of drives, [n] by the names of TRAFFIC.
+
+    Only what happens before an ending crash counts; the shares of time are of all of
+    the drive.
+
+    Args:
+      record: leaves [n, S], numpy.
+      lasts: [n, S] bool, the recorded time.
+    """
+    valid = lasts & np.asarray(record.valid)
+    happens = {
+        "collision": record.at_fault > 0,
+        "ttc": record.ttc_counts & (record.ttc < MetricsConfig.nuplan_ttc),
+        "braking": record.induced_braking > BRAKING_MPS2,
+    }
+    close = (record.headway < HEADWAY_S) & (record.v > MOVING_MPS) & valid
+    found = {key: np.any(x & valid, axis=1) for key, x in happens.items()}
+    found["headway"] = close.sum(axis=1) / lasts.sum(axis=1)
+    return {key: np.asarray(x, np.float64) for key, x in found.items()}

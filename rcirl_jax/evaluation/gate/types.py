@@ -14,7 +14,15 @@ from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
 from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
 
-Kind = Literal["safety", "no loss", "families", "trivial baselines", "likeness", "gain"]
+Kind = Literal[
+    "safety",
+    "recorded traffic",
+    "no loss",
+    "families",
+    "trivial baselines",
+    "likeness",
+    "gain",
+]
 Outcome = Literal["pass", "fail", "open"]
 Decision = Literal["ship", "do not ship", "no difference", "could not judge"]
 
@@ -32,7 +40,7 @@ AT_HIGHEST = "candidate, highest gain"
 MAX_ACCEPTED = 3  # cases; more than a person looks at are no exceptions
 IMPACT_MPS = 10.0  # m/s at which an at-fault impact counts as one
 FELT = ("rms_a", "rms_j")  # fields of CaseMetrics: comfort, of which less is better
-DRIVES = 240  # held-out drives of a full run, or all there are
+DRIVES = 4000  # held-out drives of a full run, or all there are
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,8 +69,12 @@ class GateConfig:
     progress: float = 0.01
     family_progress: float = 0.10
     # share of the incumbent's distance to the human. 240 drives of 163 vehicles told
-    # rewards apart by 11 to 13 % of it
+    # rewards apart by 11 to 13 % of it, all drives by less
     likeness: float = 0.10
+    # among recorded traffic: vehicles in whose drives there is more of a fault, share
+    # of all; and time with a short headway, as a share of time
+    recorded: float = 0.025
+    headway: float = 0.05
     # loss in one primary metric that a gain in another may cost; share of cases, of
     # the score, or of the incumbent's RMS
     gain: float = 0.02
@@ -105,6 +117,11 @@ class Likeness:
     distance: Mapping[str, np.ndarray]
     clusters: np.ndarray  # [D] int, the ego's vehicle in each drive
     available: int  # held-out drives that the recordings have
+    # row name -> "collision", "ttc", "braking" and "headway" of `likeness.TRAFFIC`, [D]
+    # each: 0 or 1, and a share of time
+    traffic: Mapping[str, Mapping[str, np.ndarray]] = dataclasses.field(
+        default_factory=dict
+    )
 
     @property
     def left_out(self) -> str:

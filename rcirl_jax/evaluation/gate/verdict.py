@@ -5,6 +5,10 @@ Six kinds of check, none of them on a learned reward:
     safety      not more cases with a preventable at-fault collision, a collision with
                 a pedestrian or cyclist, a red light or a stop sign run than the
                 incumbent, up to a declared margin
+    recorded traffic    on held-out recorded drives among replayed traffic that reacts:
+                not more vehicles with an at-fault collision, with too little time to a
+                collision, or with somebody made to brake hard, and no more time with a
+                short headway, up to margins
     no loss     rates, impact speeds and progress over all cases are not worse than the
                 incumbent's by more than a margin: the lower end of the paired 95 %
                 interval over cases lies above it
@@ -139,6 +143,7 @@ def judge(pair: Pair, config: GateConfig, part: str = "") -> Verdict:
     checks = (
         *_not_driven(pair),
         *_no_more("safety", pair, pair.incumbent, config),
+        *_recorded(pair, config),
         *_no_loss(pair, config),
         *_at_highest(pair, config),
         *_families(pair, config),
@@ -430,6 +435,42 @@ def _no_loss(pair: Pair, config: GateConfig) -> Iterator[Check]:
         title = WORDS[name].title
         numbers = {"margin": margin, "pairs": pairs, "note": note}
         yield _check("no loss", name, title, found, fails, passes, **numbers)
+
+
+def _recorded(pair: Pair, config: GateConfig) -> Iterator[Check]:
+    """Compares safety on held-out drives; vehicles are what is independent.
+
+    A vehicle is lost if the candidate has more of a fault in its drives than the
+    incumbent has. Collisions are judged as those of the suite (`_no_more`), the others
+    as what must not be lost (`_no_loss`).
+    """
+    known, kind = pair.likeness, "recorded traffic"
+    if known is None or not {CANDIDATE, pair.name} <= known.traffic.keys():
+        return
+    vehicles, index = np.unique(known.clusters, return_inverse=True)
+    if (total := vehicles.size) < MIN_CLUSTERS:
+        return  # as the check of likeness says
+    mine, theirs = known.traffic[CANDIDATE], known.traffic[pair.name]
+    margin = config.recorded
+    for name in ("collision", "ttc", "braking"):
+        more = np.bincount(index, mine[name] - theirs[name], total)
+        pairs, note = (int(np.sum(more < 0.0)), int(np.sum(more > 0.0))), ""
+        found, p = paired_rates(pairs, total), no_more_faults(*pairs, total, margin)
+        fails, passes = found.mean < 0.0 and found.p < 2.0 * ALPHA, p <= ALPHA
+        if name != "collision":
+            passes = found.low > -margin
+            fails = bool(found.high < 0.0 and not passes)
+        if not (fails or passes) and no_more_faults(0, 0, total, margin) > ALPHA:
+            note = f"{total} vehicles can never prove a margin of {100 * margin:g} %"
+        name = f"recorded {name}"
+        numbers = {"margin": margin, "pairs": pairs, "p": p, "note": note}
+        yield _check(kind, name, WORDS[name].title, found, fails, passes, **numbers)
+    name, margin = "recorded headway", config.headway
+    clusters = ClusterBootstrap(index)
+    found = over_clusters(theirs["headway"], mine["headway"], clusters)
+    passes = found.low > -margin
+    fails = bool(found.high < 0.0 and not passes)
+    yield _check(kind, name, WORDS[name].title, found, fails, passes, margin=margin)
 
 
 def _at_highest(pair: Pair, config: GateConfig) -> Iterator[Check]:

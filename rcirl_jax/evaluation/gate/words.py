@@ -44,6 +44,11 @@ def _holds(what: str) -> Words:
     return Words(f"drives that keep {what}", f"{worse} drives", f"{better} drives")
 
 
+def _recorded(what: str, worse: str) -> Words:
+    numbers = "{lost} vehicles more, {gained} fewer"
+    return Words(f"recorded vehicles with {what}", f"{worse} ({numbers})")
+
+
 WORDS = {
     "collision": _fault(
         "preventable at-fault collision", "preventable at-fault collisions"
@@ -65,6 +70,21 @@ WORDS = {
     "impact": Words(
         "speed of at-fault impacts",
         "hits harder at fault, by {harder} m/s in 1,000 cases",
+    ),
+    "recorded collision": _recorded(
+        "an at-fault collision", "collides more often among recorded traffic"
+    ),
+    "recorded ttc": _recorded(
+        "less than 0.95 s to a collision",
+        "comes closer to collisions among recorded traffic",
+    ),
+    "recorded braking": _recorded(
+        "somebody made to brake above 4 m/s²",
+        "makes others brake hard more often among recorded traffic",
+    ),
+    "recorded headway": Words(
+        "time with a headway below 1 s",
+        "keeps short headways in {size} % more of the time among recorded traffic",
     ),
     "progress": Words("progress", "makes {less} % less progress", "progress {more} %"),
     "rms_a": Words(
@@ -107,7 +127,15 @@ MAIN = {
     "nuPlan's score": {"nuplan"},
 }
 # kinds in the order of the sentence's losses: faults first, trivial baselines last
-ORDER = ("safety", "families", "no loss", "gain", "likeness", "trivial baselines")
+ORDER = (
+    "safety",
+    "recorded traffic",
+    "families",
+    "no loss",
+    "gain",
+    "likeness",
+    "trivial baselines",
+)
 
 
 def words_of(check: Check) -> Words:
@@ -268,6 +296,7 @@ OUTCOMES = {"pass": "ok", "fail": "FAIL", "open": "open"}
 OF_GAINS = {"pass": "better", "fail": "FAIL", "open": "-"}
 TITLES = {
     "safety": "Not more cases with a fault (p: of as many more as the margin)",
+    "recorded traffic": "Among recorded traffic, held-out drives (shares of vehicles)",
     "no loss": "No loss beyond the margin, over all cases",
     "families": "No loss beyond the margin in any family (p: Holm; the ten worst)",
     "trivial baselines": "Ahead of rewards that know nothing",

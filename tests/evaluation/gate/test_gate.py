@@ -13,7 +13,6 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.summary import SuiteRuns
 from rcirl_jax.evaluation.gate.types import (
     AT_HIGHEST,
-    DRIVES,
     EXIT_CODES,
     TRIVIAL_BASELINES,
     GateConfig,
@@ -26,7 +25,7 @@ from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
 
 FAMILIES, EACH = 20, 200  # 4,000 cases: about as many as the suite has
 CASES = FAMILIES * EACH
-RECORDINGS = 12  # of the held-out drives
+DRIVES, RECORDINGS = 240, 12  # of the held-out drives
 A, J = COLUMNS.index("a_station"), COLUMNS.index("j_station")
 
 
