@@ -85,6 +85,12 @@ def test_warnings_are_at_the_top_of_their_sections(page):
     assert page.count("<strong>Warning:</strong>") == len(WARNINGS)
 
 
+def test_the_arguments_against_stand_at_the_verdict(page, report):
+    assert report.verdict.against
+    words = html.unescape(re.sub(r"<.*?>", "", section(page, "verdict")))
+    assert all(f"{said}." in words for said in report.verdict.against)
+
+
 def test_shares_of_plans_are_those_of_the_file(page):
     found = [row for row in Page(section(page, "decided")).rows if len(row) == 4]
     share, rest = "25 [10, 40] %", ["2.0", "20"]

@@ -204,6 +204,7 @@ class Verdict:
     new_faults: tuple[NewFault, ...]
     look_at: tuple[str, ...]  # ids of cases that differ, the worst first
     part: str  # what of the suite was left out, in words; "" if nothing
+    against: tuple[str, ...] = ()  # the best arguments against it (`gate.against`)
 
     @property
     def exit_code(self) -> int:

@@ -49,6 +49,7 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, SuiteResult
 from rcirl_jax.evaluation.closed_loop.summary import result_hash
+from rcirl_jax.evaluation.gate.against import against
 from rcirl_jax.evaluation.gate.types import (
     AT_HIGHEST,
     CANDIDATE,
@@ -176,6 +177,7 @@ def judge(pair: Pair, config: GateConfig, part: str = "") -> Verdict:
         new_faults=faults,
         look_at=_look_at(pair, checks, [f.case for f in faults if not f.accepted]),
         part=part,
+        against=against(pair, checks),
     )
     return dataclasses.replace(verdict, sentence=sentence(pair, verdict))
 

@@ -310,6 +310,9 @@ def format_verdict(verdict: Verdict) -> str:
     lines = textwrap.wrap(verdict.sentence, WIDTH)
     lines += ["", f"verdict: {verdict.decision.upper()}"]
     lines += [line for said in verdict.reasons for line in _item(said)]
+    if verdict.against:
+        lines += ["", "the best arguments against it"]
+        lines += [line for said in verdict.against for line in _item(said)]
     lines += ["", f"{verdict.cases:,} cases of {verdict.families} families; % of cases"]
     if verdict.part:
         lines += textwrap.wrap(f"a part only: {verdict.part}", WIDTH)

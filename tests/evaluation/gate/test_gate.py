@@ -229,6 +229,35 @@ def test_what_varies_by_scene_is_judged_at_its_highest_too():
     assert "progress, at the highest gain everywhere" in format_verdict(verdict)
 
 
+def test_the_best_arguments_against_a_candidate_that_ships():
+    """It loses 4 % in a family, a driver may be as near to people, another scores more.
+
+    Without them it is the faults that 4,000 cases without any leave possible: 0.1 %.
+    """
+    base, alone = drives(), dict.fromkeys(TRIVIAL_BASELINES, drives())
+    mine = further(smoother(base), 0.96, slice(EACH))
+    rows = alone | {"IDM": further(base, 1.5)}
+    near = likeness(candidate=0.5, IDM=0.5)
+    verdict = judge(pair(mine, base, rows=rows, likeness=near), GateConfig())
+    assert verdict.decision == "ship"
+    family, nearer, higher = verdict.against
+    assert family.startswith(
+        'It loses most in "family00": 4.0 % less progress than the'
+    )
+    assert nearer.startswith("On held-out recordings it is not shown to be nearer to")
+    assert " than IDM: its distance minus that one's " in nearer
+    assert higher.startswith("IDM has more of nuPlan's points: by ")
+    assert higher[:-1] in " ".join(format_verdict(verdict).split())
+    far = likeness(candidate=0.5)
+    (left,) = judge(
+        pair(smoother(base), base, rows=dict(alone), likeness=far), GateConfig()
+    ).against
+    assert left == (
+        "Of 4,000 cases up to 4 more with preventable at-fault collisions are not "
+        "excluded; counted were 0 more, 0 fewer"
+    )
+
+
 def part_of(whole, at):
     """The same pair on some of its cases."""
     names = ("groups", "ids", "way", "preventable", "trivial")
