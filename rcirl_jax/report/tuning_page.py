@@ -121,7 +121,7 @@ class TuningReport:
     workdir: Path | None  # run whose training curve is drawn
     sweep: Mapping | None  # contents of sweep.json
     dial: Mapping | None  # contents of dial.json
-    decided: Mapping  # contents of decided.json
+    decided: Mapping | None  # contents of decided.json
     likeness: str  # table of held-out drives; "" without
     training_runs: int  # of which the candidate is the median one
     # why numbers may be worth nothing, by the anchor of their section
@@ -148,6 +148,7 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
         quality = format_quality(report.dataset.manifest.quality)
     own = own_weights(reward) if features_of(reward).own and not hidden else {}
     without = {"training": not workdir, "dial": not report.dial, "own_terms": not own}
+    without["decided"] = not report.decided
     shown = [entry for entry in CONTENTS if not without.get(entry[0])]
     margins = [
         (name.replace("_", " "), f"{100.0 * value:g} %")
@@ -285,8 +286,11 @@ def _amount(
     }
 
 
-def decided_tables(decided: Mapping) -> list[Table]:
+def decided_tables(decided: Mapping | None) -> list[Table]:
     """Return shares of plans that differ from the own cost's, by family and site."""
+
+    if decided is None:
+        return []
 
     def cells(name: str, one: Mapping) -> tuple[str, ...]:
         share = f"{100.0 * one['share']:.0f} %"

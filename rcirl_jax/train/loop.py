@@ -262,10 +262,8 @@ def _train(
         )
     warnings: tuple[str, ...] = ()
     if is_first():
-        rows = read_metrics(workdir / "metrics.jsonl")
-        said = plateau_warning(
-            [np.nan if row.get("loss") is None else row["loss"] for row in rows]
-        )
+        found = [row.get("loss") for row in read_metrics(workdir / "metrics.jsonl")]
+        said = plateau_warning(np.array(found, float))  # None becomes NaN
         warnings = (said,) if said else ()
         describe_run(workdir, config, dataset, {**provenance, "warnings": warnings})
     return TrainResult(

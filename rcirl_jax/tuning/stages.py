@@ -600,7 +600,11 @@ def report(
                 workdir=training_of_candidate(run),
                 sweep=read_sweep(config.sweep) if config.sweep else None,
                 dial=read_json(run.dial, "a dial") if run.dial.exists() else None,
-                decided=read_json(run.decided, "shares of plans"),
+                decided=(
+                    read_json(run.decided, "shares of plans")
+                    if run.decided.exists()
+                    else None
+                ),
                 likeness=(run.folder / "likeness.txt").read_text(),
                 training_runs=config.seeds,
                 warnings=warnings_of(run),

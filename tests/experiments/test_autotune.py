@@ -79,7 +79,8 @@ def test_a_small_loop(tmp_path):
     assert "features without effect" in done.stdout
     likeness = json.loads((run / "likeness.json").read_text())
     rows = {"candidate", "hand-set", "IDM", "IDM, tuned", "constant V", "+velocity"}
-    assert rows | {"random weights", "recorded human"} == set(likeness["rows"])
+    others = {"random weights", "recorded human", "candidate, highest gain"}
+    assert rows | others == set(likeness["rows"])
     table = (run / "suite" / "table.txt").read_text()
     assert all(name in table for name in rows)
     dial = json.loads((run / "dial.json").read_text())
@@ -95,6 +96,10 @@ def test_a_small_loop(tmp_path):
     assert (tmp_path / "turned").read_bytes() == turned
     kinds = {check["kind"] for check in verdict["checks"]}
     assert {"safety", "trivial baselines", "likeness", "gain"} <= kinds
+    assert verdict["warnings"]["training"][0].startswith("training: ")
+    assert verdict["against"]
+    shares = json.loads((run / "decided.json").read_text())
+    assert shares["sites"]["all"]["moments"] > 0
     noted = json.loads((run / "stages.json").read_text())["stages"]
     assert list(noted) == stages
     known = {"git_commit", "code_sha256", "versions", "flags"}

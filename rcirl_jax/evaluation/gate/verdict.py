@@ -633,8 +633,9 @@ def _gains(pair: Pair, config: GateConfig) -> Iterator[Check]:
         elif name == "progress":
             both = _progress(pair)
         elif name in FELT:
-            each = [np.asarray(getattr(m, name), np.float64) for m in drives]
-            both = tuple(-x / max(float(each[1].mean()), 1e-9) for x in each)
+            a, b = (np.asarray(getattr(m, name), np.float64) for m in drives)
+            scale = max(float(b.mean()), 1e-9)
+            both = -a / scale, -b / scale
         else:  # nuPlan's score
             way = jnp.asarray(pair.runs.way)
             a, b = (np.asarray(nuplan_score(m, way)[0], np.float64) for m in drives)
