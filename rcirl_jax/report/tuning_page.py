@@ -288,7 +288,6 @@ def _amount(
 
 def decided_tables(decided: Mapping | None) -> list[Table]:
     """Return shares of plans that differ from the own cost's, by family and site."""
-
     if decided is None:
         return []
 
