@@ -39,7 +39,12 @@ from rcirl_jax.export.forms import (
     write_onnx,
     write_stablehlo,
 )
-from rcirl_jax.export.from_run import datasets_of, export_run, tags_of
+from rcirl_jax.export.from_run import (
+    data_weights_of,
+    datasets_of,
+    export_run,
+    tags_of,
+)
 from rcirl_jax.export.loading import features_of, open_reward
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.weights import save_with_dial
@@ -122,7 +127,8 @@ def main() -> None:
     else:
         workdir = Path(str(_RUN.value))
         output = Path(_OUTPUT.value or workdir / "weights.msgpack")
-        dataset = open_datasets(_DATA.value or datasets_of(workdir))
+        names = _DATA.value or datasets_of(workdir)
+        dataset = open_datasets(names, weights=data_weights_of(workdir))
         dataset = with_tags(dataset, tags_of(workdir))
         reward = export_run(workdir, dataset, output)
         print(f"{output}: {len(reward.names)} features, sha256 {reward.sha256[:16]}...")

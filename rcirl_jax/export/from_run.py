@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.data.store.dataset import Demonstrations
+from rcirl_jax.data.store.dataset import EQUAL, Demonstrations
 from rcirl_jax.errors import MALFORMED, InputError
 from rcirl_jax.export.reader import FAMILIARITY, MAX_NAME, PriorCost, Reward
 from rcirl_jax.export.weights import save
@@ -69,6 +69,12 @@ def datasets_of(workdir: Path) -> list[str]:
                 "a list of them; or give data"
             )
     return names
+
+
+def data_weights_of(workdir: Path) -> str:
+    """Return the share of each dataset that a run's flags name (`open_datasets`)."""
+    found = read_config(workdir)[1].get("flags", {}).get("data_weights")
+    return found if isinstance(found, str) else EQUAL
 
 
 def tags_of(workdir: Path) -> list[str]:

@@ -308,23 +308,30 @@ def plans_along(
       config: of the drives; with `frames_every`.
 
     Returns:
-      Planned stations [P, B, M, T] m from the ego, and [B, M] bool: the drive lasts.
+      Planned stations and, where paths are planned, offsets [P, B, M, 2, T] m, and
+      [B, M] bool: the drive lasts.
     """
     cases, length = _completed(cases), config.span
     program = _compiled(policy, config.plan_every, length, config.vehicle)
     manner, steers = config.manner(), _steers(policy)
     now, limits = _begin(cases, steers)
-    stations, lasts = [], []
+    places, lasts = [], []
     for at in range(0, config.steps, length):
         if at % config.frames_every == 0:
             long_ago = jnp.full_like(now.plan.since_choice, math.inf)
             due = now.replace(plan=now.plan.replace(since_choice=long_ago))
             made = [program(x, cases, manner, limits, due)[1] for x in params]
             seen = [_unpacked(np.asarray(x)[0], cases, steers) for x in made]
-            stations.append([shot.plan_s for _, shot in seen])
+            places.append([_planned(shot) for _, shot in seen])
             lasts.append(seen[0][0].valid)
         now, _ = program(params[0], cases, manner, limits, now)
-    return np.moveaxis(np.array(stations), 0, 2), np.stack(lasts, axis=1)
+    return np.moveaxis(np.array(places), 0, 2), np.stack(lasts, axis=1)
+
+
+def _planned(shot: Snapshot) -> np.ndarray:
+    """Planned stations and offsets [B, 2, T] m, 0 from a path that is given."""
+    aside = np.zeros_like(shot.plan_s) if shot.plan_l is None else shot.plan_l
+    return np.stack([shot.plan_s, aside], axis=1)
 
 
 def _snapshot(case: Case, now: World, after: World, plan: Plan) -> Snapshot:

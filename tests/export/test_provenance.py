@@ -6,7 +6,7 @@ import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export import pack
-from rcirl_jax.export.from_run import datasets_of
+from rcirl_jax.export.from_run import data_weights_of, datasets_of
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import load_weights
 from rcirl_jax.runtime.atomic_files import write_json
@@ -65,10 +65,10 @@ def test_times_that_no_trajectory_here_has(tmp_path, times):
         open_reward(str(path))
 
 
-def run_on(folder, data):
+def run_on(folder, data, **flags):
     """A run's folder whose flags name these data."""
     config = dataclasses.asdict(TrainConfig())
-    body = {"config": config, "flags": {"data": data}}
+    body = {"config": config, "flags": {"data": data, **flags}}
     write_json(folder / "run.json", body)
     return folder
 
@@ -79,6 +79,13 @@ def test_names_that_no_dataset_can_have(tmp_path, found):
         InputError, match=r"run\.json: flags\.data: .*expected a dataset"
     ):
         datasets_of(run_on(tmp_path, found))
+
+
+def test_a_run_is_exported_with_its_own_shares_of_the_data(tmp_path):
+    """They are part of the hash of joined datasets, which the export compares."""
+    assert data_weights_of(run_on(tmp_path, ["a", "b"])) == "equal"
+    shared = run_on(tmp_path, ["a", "b"], data_weights="scenes")
+    assert data_weights_of(shared) == "scenes"
 
 
 def test_a_run_that_is_none_is_one_line(tmp_path):

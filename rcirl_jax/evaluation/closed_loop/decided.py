@@ -63,7 +63,8 @@ def decided(
         at = np.minimum(np.arange(first, first + LANES), count - 1)
         some = jax.tree.map(lambda x: np.asarray(x)[at], cases)
         plans, fine = plans_along(row.policy, (row.params, own.params), some, config)
-        return np.abs(plans[0] - plans[1])[: count - first], fine[: count - first]
+        apart = np.hypot(*np.moveaxis(plans[0] - plans[1], 2, 0))
+        return apart[: count - first], fine[: count - first]
 
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
         made = list(pool.map(group, range(0, count, LANES)))
