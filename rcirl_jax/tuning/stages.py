@@ -411,9 +411,9 @@ def compare_choices(run: Run, sources: Sequence[Dataset]) -> None:
 
 
 def site_of(dataset: Dataset, number: int) -> str:
-    """Names a source by what was recorded: "0: NGSIM US-101 (...)"."""
-    names = dict.fromkeys(str(x["source"]) for x in dataset.manifest.sources)
-    return f"{number}: {', '.join(names)}"
+    """Names a source by its recordings: "0: us101-1 to us101-2"."""
+    first, *more = dataset.manifest.recordings
+    return f"{number}: {first}" + (f" to {more[-1]}" if more else "")
 
 
 def dial_plan(job: SuiteJob) -> tuple[tuple[float, ...], list[int]]:

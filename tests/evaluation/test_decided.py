@@ -10,11 +10,11 @@ from rcirl_jax.runtime.compiling import compiles
 from rcirl_jax.simulation.rows import baseline_row
 from rcirl_jax.simulation.suite import build, drive_row, rollout_config, suite_refs
 
-SECONDS = 5.0  # moments at 0, 2 and 4 s
+SECONDS = 9.0  # moments at 0, 4 and 8 s
 
 
 def test_shares_of_plans_that_differ():
-    """None against itself; on an empty road "as fast as possible" is no hand-set cost.
+    """None against itself; before a light "as fast as possible" is no hand-set cost.
 
     The programs are those of the drives.
     """
@@ -33,8 +33,8 @@ def test_shares_of_plans_that_differ():
     assert list(other) == ["all", "free_cruise", "red_light"]
     assert [one["moments"] for one in other.values()] == [18, 9, 9]
     assert all(one["share"] == one["apart_m"] == 0.0 for one in same.values())
-    assert other["free_cruise"]["share"] > 0.2
-    assert other["free_cruise"]["apart_m"] > 0.1
+    assert 0.2 < other["red_light"]["share"] < 1.0
+    assert other["red_light"]["apart_m"] > 0.1
     parts = [other[name]["share"] for name in ("free_cruise", "red_light")]
     assert other["all"]["share"] == pytest.approx(np.mean(parts))
     assert other["all"]["low"] <= other["all"]["share"] <= other["all"]["high"]

@@ -1,9 +1,10 @@
 """How much the learned part decides: plans that differ from the own cost's choice.
 
-Every two seconds of its drives the candidate and its own cost alone choose in the same
+Every four seconds of its drives the candidate and its own cost alone choose in the same
 scene, among the same candidates and with the same plan in force
-(`rollout.plans_along`). A plan differs if the ego would be elsewhere at any planned
-time. Where the safety filter leaves one plan, both take it: such moments count too.
+(`rollout.plans_along`). A plan differs if the ego would be more than `SAME_M` elsewhere
+at any planned time. Where the safety filter leaves one plan, both take it: such moments
+count too.
 """
 
 import concurrent.futures
@@ -21,8 +22,8 @@ from rcirl_jax.simulation.rows import Row
 from rcirl_jax.simulation.suite import rollout_config
 from rcirl_jax.units import TIMES_S
 
-EVERY_S = 2.0  # s between two moments
-SAME_M = 1e-3  # m; one plan, made by one program, is the same to the bit
+EVERY_S = 4.0  # s between two moments
+SAME_M = 0.1  # m within which two plans are one
 FEW = 5  # clusters below which no interval over them is made
 SHOWN_S = 5.0  # s at which it is said how far apart plans are
 
