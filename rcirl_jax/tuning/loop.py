@@ -19,6 +19,7 @@ from rcirl_jax.data.store.dataset import Dataset, Demonstrations, shares_of
 from rcirl_jax.errors import InputError, extra_of
 from rcirl_jax.evaluation.closed_loop.likeness import read_arrays
 from rcirl_jax.evaluation.gate.types import CANDIDATE, DRIVES, Verdict
+from rcirl_jax.evaluation.gate.verdict import MIN_CASES
 from rcirl_jax.evaluation.gate.words import WIDTH
 from rcirl_jax.export.closed_loop import SuiteJob, checked_sampler
 from rcirl_jax.export.forms import terms_table
@@ -77,13 +78,18 @@ def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
     """
     # what would fail only after hours of work
     job, _ = suite_job(run, tuned=False)
+    names, made = STAGES[: STAGES.index(last) + 1], Made()
+    if "gate" in names and len(job.refs) < MIN_CASES:
+        raise InputError(
+            f"cases: {len(job.refs)} in all: the gate expects at least {MIN_CASES}: "
+            "give more cases of each family, or --until=simulate"
+        )
     shares = shares_of(run.config.data_weights, len(given))
     _check_incumbent(run)
     if checked_sampler(run.config.train.sampler).own:
         run.say(f"candidates: {run.config.train.sampler.own}")
     if run.own_cost:
         run.say(own_cost.words(run.own_cost))
-    names, made = STAGES[: STAGES.index(last) + 1], Made()
     with compiles() as compiled:
         clock = Clock(run, names, compiled)
         for name in _stages(run, given, shares, made):
