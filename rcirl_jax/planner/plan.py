@@ -156,6 +156,7 @@ def path_at(plan: Plan, after: ArrayLike) -> jax.Array:
     Offsets by cubic Hermite interpolation between the planned times, the rest linearly;
     after the plan's end its last offset is kept.
     """
+    assert plan.path is not None
     t = jnp.clip(plan.since + after, 0.0, TIMES_S[-1])
     low = jnp.minimum((t / DT_S).astype(jnp.int32), NUM_TIMES - 2)
     start, end = jnp.moveaxis(plan.path[:, low[..., None] + np.arange(2)], -1, 0)
@@ -284,5 +285,5 @@ def committed(
         due = ~fine | (before.since_choice >= commitment)
         return only_where(due, replan, before, params, scene, key, (before, rest))
 
-    policy.steers = sampler.mode == "path_speed"
+    vars(policy)["steers"] = sampler.mode == "path_speed"
     return policy
