@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from markupsafe import Markup
 
-from rcirl_jax.evaluation.closed_loop.summary import PAPER, summarise
+from rcirl_jax.evaluation.closed_loop.summary import PAPER, comfort_cells, summarise
 from rcirl_jax.evaluation.ranking.score import candidates_key
 from rcirl_jax.report.features import NUM_CANDIDATES, contributions
 from rcirl_jax.report.frames import _sampled
@@ -249,7 +249,11 @@ def test_the_papers_table_is_the_suites(page, report):
                     assert ends == pytest.approx(wanted, abs=0.05)
     for name, values in PAPER.items():
         assert found[name] == [[f"{value:.2f}" for value in values]] * 2
-    assert found["candidate"][3][:4] == ["12", "0", "0", "12"]
+    comfort, safety = found["candidate"][2:4]
+    assert comfort == comfort_cells(suite.rows["candidate"])
+    physical = suite.rows["candidate"].physical
+    assert float(comfort[0]) == pytest.approx(physical["rms_a"], abs=0.005)
+    assert safety[:4] == ["12", "0", "0", "12"]
     assert f"{suite.rows['candidate'].at_fault}" == "12"
 
 
