@@ -54,6 +54,7 @@ from experiments.paper.common import (
     seeds,
     write,
 )
+from experiments.paper.step_sizes import with_chosen_rates
 from rcirl_jax.cli.running import made_by_file, provenance, run
 from rcirl_jax.data.store.dataset import (
     Dataset,
@@ -123,7 +124,8 @@ def configs() -> dict[str, TrainConfig]:
         raise InputError(f"--losses: {losses}: expected rank and gan, all of {known}")
     shared = {"epochs": epochs(), "positive": positive()}
     unit = dataclasses.replace(told.reward, scale_constraint="unit")
-    rewards = {loss: unit if loss == "rank" else told.reward for loss in losses}
+    pinned = ("rank", "gan")  # the two that are compared, with one constraint
+    rewards = {loss: unit if loss in pinned else told.reward for loss in losses}
     return {
         loss: dataclasses.replace(told, loss=loss, reward=reward, **shared)
         for loss, reward in rewards.items()
@@ -333,6 +335,7 @@ def main() -> None:
     gains = {"low": _LOW.value, "high": _HIGH.value}
     shares = dataclasses.replace(load_recipe(DEFAULT).prior_cost, **gains)
     learners, (data, sources) = configs(), opened()
+    learners, how = with_chosen_rates(data, learners)
     learned, seen = trained(data, learners)
     each = [*sources.values()]
     files, spreads = written(learned, fitted(shares, each), data, each, seen)
@@ -371,7 +374,8 @@ def main() -> None:
         name: {row: found.mean(axis=1).tolist() for row, found in x.runs.items()}
         for name, x in columns.items()
     }
-    body = {"spreads": spreads, "runs": runs, "tests": tests}
+    sizes = {name: dataclasses.asdict(x) for name, x in how.items()}
+    body = {"step_sizes": sizes, "spreads": spreads, "runs": runs, "tests": tests}
     used = {"losses": [*learners], "cases": cases, "duration": duration}
     write("rank_against_gan", body, data, [*files.values()], **used)
 

@@ -28,6 +28,7 @@ from experiments.paper.common import (
     seeds,
     undefine_flags,
 )
+from experiments.paper.step_sizes import with_chosen_rates
 from rcirl_jax.cli.running import run
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite, write_suite
 from rcirl_jax.export.closed_loop import table_rows
@@ -55,7 +56,8 @@ def trained() -> dict[str, str]:
     }
     shares = dataclasses.replace(load_recipe(DEFAULT).prior_cost, **gains)
     data, sources = rank_against_gan.opened()
-    learned, seen = rank_against_gan.trained(data, rank_against_gan.configs())
+    learners, _ = with_chosen_rates(data, rank_against_gan.configs())
+    learned, seen = rank_against_gan.trained(data, learners)
     each = [*sources.values()]
     prior_cost = rank_against_gan.fitted(shares, each)
     files, _ = rank_against_gan.written(learned, prior_cost, data, each, seen)

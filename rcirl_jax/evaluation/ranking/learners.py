@@ -208,24 +208,42 @@ def train_learner(
       keep: names of the features that the network sees; None: all.
       together: as members of one program, which share the batch order of `config`.
     """
-    normaliser = normaliser_of(frozen, config, keep)
     members = [dataclasses.replace(config, seed=seed) for seed in seeds]
-    groups = [(config, members)] if together else [(one, [one]) for one in members]
+    if together:
+        return train_members(frozen, config, members, keep)
+    runs = [train_members(frozen, one, [one], keep) for one in members]
+    return [run for group in runs for run in group]
+
+
+def train_members(
+    frozen: FeatureBatch,
+    config: TrainConfig,
+    members: Sequence[TrainConfig],
+    keep: Sequence[str] | None = None,
+) -> list[Learned]:
+    """Trains members of one program: they differ in seed, step size and leaky rate.
+
+    Args:
+      frozen: of `FrozenSets`.
+      config: what they share; its seed decides the batch order.
+      members: what is trained.
+      keep: names of the features that the network sees; None: all.
+    """
+    normaliser = normaliser_of(frozen, config, keep)
+    fitted = fit(frozen, normaliser, config, members_of(members))
     found = []
-    for shared, group in groups:
-        fitted = fit(frozen, normaliser, shared, members_of(group))
-        for n, own in enumerate(group):
-            one = jax.tree.map(lambda leaf, n=n: leaf[n], fitted)
-            found.append(
-                Learned(
-                    params=one.params,
-                    normaliser=normaliser,
-                    config=own,
-                    loss=np.asarray(one.loss),
-                    wins=np.asarray(one.wins),
-                    finite=bool(one.finite),
-                )
+    for n, own in enumerate(members):
+        one = jax.tree.map(lambda leaf, n=n: leaf[n], fitted)
+        found.append(
+            Learned(
+                params=one.params,
+                normaliser=normaliser,
+                config=own,
+                loss=np.asarray(one.loss),
+                wins=np.asarray(one.wins),
+                finite=bool(one.finite),
             )
+        )
     return found
 
 
