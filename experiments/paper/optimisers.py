@@ -22,7 +22,7 @@ from experiments.paper.common import (
     seeds,
     write,
 )
-from experiments.paper.step_sizes import still_falling, with_chosen_rates
+from experiments.paper.step_sizes import RATES, still_falling, with_chosen_rates
 from rcirl_jax.cli.running import run
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.learners import scorers, train_learners
@@ -70,16 +70,22 @@ def main() -> None:
             f"{name}: the loss falls by {100.0 * still_falling(runs):.1f} % in the "
             f"last fifth of {chosen[name].epochs} epochs"
         )
-    made, axes = figure(1, 2, 11.0, 4.2)
-    wins = {n: np.array([r.wins for r in runs]) for n, runs in learned.items()}
-    epochs = np.arange(1, next(iter(wins.values())).shape[1] + 1)
-    curves_panel(axes[0, 0], epochs, wins)
-    label(axes[0, 0], "training, band: 2 s.e.", "epoch", "share of pairs won")
+    made, axes = figure(1, len(LOSSES) + 1, 16.0, 4.4)
+    for panel, loss in zip(axes[0], LOSSES, strict=False):
+        tried = {
+            one: np.array(
+                [[how[f"{loss}, {one}"].distance.get(x, np.nan) for x in RATES]]
+            )
+            for one in PAPER_OPTIMIZERS
+        }
+        curves_panel(panel, np.array(RATES), tried)
+        panel.set_xscale("log")
+        label(panel, f"{loss}: validation", "step size", "distance of the chosen, m")
     found = {name: row["top1_fde"] for name, row in report.rows.items()}
     interval_panel(
-        axes[0, 1], {name: (x.value, x.low, x.high) for name, x in found.items()}
+        axes[0, -1], {name: (x.value, x.low, x.high) for name, x in found.items()}
     )
-    label(axes[0, 1], "held out: distance of the chosen", "m, lower is better", "")
+    label(axes[0, -1], "held out: distance of the chosen", "m, lower is better", "")
     save(made, picture("optimisers"))
     write(
         "optimisers",
@@ -87,7 +93,7 @@ def main() -> None:
             "step_sizes": {name: dataclasses.asdict(x) for name, x in how.items()},
             "epochs": {name: one.epochs for name, one in chosen.items()},
             "loss_still_falls": {n: still_falling(x) for n, x in learned.items()},
-            "wins": {name: runs.tolist() for name, runs in wins.items()},
+            "wins": {n: [r.wins.tolist() for r in x] for n, x in learned.items()},
             "finite": {n: all(r.finite for r in runs) for n, runs in learned.items()},
             "ranking": to_json(report),
         },

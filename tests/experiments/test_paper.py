@@ -85,7 +85,11 @@ def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
     assert body["made_by"]["data_hash"]
     if name == "optimisers":
         rows = body["ranking"]["rows"]
-        assert len({rows[x]["top1_fde"]["value"] for x in PAPER_OPTIMIZERS}) == 3
+        found = {rows[f"rank, {x}"]["top1_fde"]["value"] for x in PAPER_OPTIMIZERS}
+        assert len(found) == 3
+        for one in body["step_sizes"].values():
+            tried = {float(rate): far for rate, far in one["distance"].items()}
+            assert tried[one["chosen"]] == min(tried.values())
     assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
