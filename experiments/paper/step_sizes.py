@@ -89,11 +89,11 @@ def with_chosen_rates(
             )
             for i, run in enumerate(runs)
         ]
-        trains = np.reshape([run.finite for run in runs], (-1, SEEDS)).all(axis=1)
+        trains = np.all(np.reshape([run.finite for run in runs], (-1, SEEDS)), axis=1)
         means = np.reshape(ends, (-1, SEEDS)).mean(axis=1)
         distance = {
             rate: float(mean)
-            for rate, mean, fine in zip(rates, means, trains, strict=True)
+            for rate, mean, fine in zip(rates, means, trains.tolist(), strict=True)
             if fine
         }
         best = min(distance, key=lambda rate: distance[rate])
