@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import ttest_ind
 
 from experiments.paper.common import base, dataset, fixed, picture, seeds, write
-from experiments.paper.step_sizes import still_falling, with_chosen_rates
+from experiments.paper.step_sizes import plateau_warnings, with_chosen_rates
 from rcirl_jax.cli.running import run
 from rcirl_jax.evaluation.ranking.learners import (
     Learned,
@@ -115,7 +115,7 @@ def main() -> None:
         "rows": body,
         "differences": apart,
         "step_sizes": {name: dataclasses.asdict(x) for name, x in how.items()},
-        "loss_still_falls": {n: still_falling(x) for n, x in learned.items()},
+        "warnings": plateau_warnings(learned),
     }
     write("discount_factors", written, data)
 

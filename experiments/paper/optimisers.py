@@ -22,7 +22,7 @@ from experiments.paper.common import (
     seeds,
     write,
 )
-from experiments.paper.step_sizes import RATES, still_falling, with_chosen_rates
+from experiments.paper.step_sizes import RATES, plateau_warnings, with_chosen_rates
 from rcirl_jax.cli.running import run
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.learners import scorers, train_learners
@@ -65,11 +65,7 @@ def main() -> None:
     )
     report = evaluate_ranking(data, scorers(learned), setup, references=REFERENCES)
     print(format_table(report, 118))
-    for name, runs in learned.items():
-        print(
-            f"{name}: the loss falls by {100.0 * still_falling(runs):.1f} % in the "
-            f"last fifth of {chosen[name].epochs} epochs"
-        )
+    warnings = plateau_warnings(learned)
     made, axes = figure(1, len(LOSSES) + 1, 16.0, 4.4)
     for panel, loss in zip(axes[0], LOSSES, strict=False):
         tried = {
@@ -92,7 +88,7 @@ def main() -> None:
         {
             "step_sizes": {name: dataclasses.asdict(x) for name, x in how.items()},
             "epochs": {name: one.epochs for name, one in chosen.items()},
-            "loss_still_falls": {n: still_falling(x) for n, x in learned.items()},
+            "warnings": warnings,
             "wins": {n: [r.wins.tolist() for r in x] for n, x in learned.items()},
             "finite": {n: all(r.finite for r in runs) for n, runs in learned.items()},
             "ranking": to_json(report),

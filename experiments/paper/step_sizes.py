@@ -17,6 +17,7 @@ from rcirl_jax.evaluation.ranking.evaluate import covered_rows
 from rcirl_jax.evaluation.ranking.learners import FrozenSets, Learned, train_members
 from rcirl_jax.evaluation.ranking.metrics import scene_metrics
 from rcirl_jax.evaluation.ranking.score import RankingSetup, score_scenes
+from rcirl_jax.train.metrics import plateau_warning
 from rcirl_jax.train.state import TrainConfig
 
 STEPS = flags.DEFINE_integer(
@@ -109,13 +110,13 @@ def with_chosen_rates(
     return made, found
 
 
-def still_falling(runs: Sequence[Learned]) -> float:
-    """Returns how much the loss still falls at the end of the trainings, relatively.
-
-    Mean loss of the last fifth of the epochs against that of the fifth before, mean
-    over runs: a training at its plateau is near 0.
-    """
-    loss = np.stack([run.loss for run in runs])
-    fifth = max(loss.shape[1] // 5, 1)
-    last, before = loss[:, -fifth:].mean(), loss[:, -2 * fifth : -fifth].mean()
-    return float((before - last) / max(abs(before), 1e-9))
+def plateau_warnings(learned: Mapping[str, Sequence[Learned]]) -> dict[str, list[str]]:
+    """Says and returns, by row, which of its trainings ended before a plateau."""
+    found = {
+        name: [said for one in runs if (said := plateau_warning(one.step_loss))]
+        for name, runs in learned.items()
+    }
+    for name, said in found.items():
+        if said:
+            print(f"warning: {name}: {len(said)} of its runs: {said[0]}")
+    return found

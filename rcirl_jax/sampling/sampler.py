@@ -640,7 +640,7 @@ def lateral_moves(scene: Scene, config: SamplerConfig) -> Moves:
 def _in_front(
     scene: Scene, centre: jax.Array
 ) -> tuple[tuple[jax.Array, jax.Array], jax.Array, jax.Array]:
-    """What is to be passed: the nearest body in the lane's middle, and those with it.
+    """Finds the body to pass: the nearest in the lane's middle, and those with it.
 
     Returns:
       Offsets m of its right and left side, the station m at which the ego has to be

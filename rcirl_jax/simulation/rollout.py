@@ -295,7 +295,7 @@ def rollout(
 def plans_along(
     policy: Policy, params: Sequence[Params], cases: Case, config: RolloutConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What several weights of one policy would plan along the drives of the first.
+    """Plans by several weights of one policy along the drives of the first.
 
     At every moment that is looked at (`frames_every` steps) each of them chooses in the
     same scene, among the same candidates and with the same plan in force, as if a

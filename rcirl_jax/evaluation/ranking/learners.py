@@ -94,6 +94,7 @@ class Learned:
     config: TrainConfig
     loss: np.ndarray  # [epochs]
     wins: np.ndarray  # [epochs]
+    step_loss: np.ndarray  # [steps]
     finite: bool  # no step was refused for a NaN or infinity
 
     @property
@@ -241,6 +242,7 @@ def train_members(
                 config=own,
                 loss=np.asarray(one.loss),
                 wins=np.asarray(one.wins),
+                step_loss=np.asarray(one.step_loss),
                 finite=bool(one.finite),
             )
         )
@@ -249,7 +251,7 @@ def train_members(
 
 def untrained(runs: Sequence[Learned]) -> list[Learned]:
     """Networks 21-15-1 before their first step, with the runs' inputs and seeds."""
-    nothing = {"loss": np.zeros(0), "wins": np.zeros(0)}
+    nothing = dict.fromkeys(("loss", "wins", "step_loss"), np.zeros(0))
     made = []
     for run in runs:
         config = dataclasses.replace(run.config, reward=RewardConfig(), loss="rank")
