@@ -17,9 +17,11 @@ from rcirl_jax.cli.running import run
 from rcirl_jax.evaluation.gate.types import DRIVES
 from rcirl_jax.runtime.executors import make_executor
 
-_CANDIDATE = flags.DEFINE_string("candidate", None, "weights file", required=True)
+_CANDIDATE = flags.DEFINE_string(
+    "candidate", None, "weights file, own cost or planner:COMMAND", required=True
+)
 _INCUMBENT = flags.DEFINE_string(
-    "incumbent", "hand-set", "weights file, own cost or baseline"
+    "incumbent", "hand-set", "as --candidate, or a baseline"
 )
 _OUTPUT = flags.DEFINE_string("output", None, "JSON to write", required=True)
 _DATA = flags.DEFINE_list("data", [], "datasets whose held-out drives are compared")

@@ -147,9 +147,9 @@ def gate(
     Both drive the same cases; no learned reward judges (docs/gate.md).
 
     Args:
-      candidate: weights file.
-      incumbent: weights file, a baseline's name, or "FILE.py:FUNCTION" or
-        "FILE.so" of an own cost.
+      candidate: weights file, "FILE.py:FUNCTION" or "FILE.so" of an own cost, or
+        "planner:COMMAND" of a program.
+      incumbent: one of these, or a baseline's name.
       data: datasets whose held-out drives measure its distance to people; without
         any that is not measured, and nothing ships.
       suite: as `simulate`; nothing ships on a part of "full".

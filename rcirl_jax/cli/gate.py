@@ -3,6 +3,7 @@
     rcirl gate --candidate=FILE --incumbent=FILE --data=DATASET --output=verdict.json
     rcirl gate --candidate=FILE --incumbent=hand-set --output=verdict.json
     rcirl gate --candidate="planner:./my_planner --flag" --output=verdict.json
+    rcirl gate --candidate=new.py:cost --incumbent=old.py:cost --output=verdict.json
 
 Both drive the same closed-loop cases; no learned reward judges. Refused (3)
 if the candidate has more cases with a fault than the incumbent, if rates or progress
@@ -24,12 +25,12 @@ from rcirl_jax.evaluation.gate.types import DRIVES
 from rcirl_jax.evaluation.gate.verdict import write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
 from rcirl_jax.export.closed_loop import (
-    checked_own_cost,
+    checked_planner,
     gate_job,
     judged,
     read_tuned_idm,
 )
-from rcirl_jax.planner import own_cost
+from rcirl_jax.planner.own_cost import OwnCost, words
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.simulation.rows import BASELINES
 
@@ -40,7 +41,8 @@ USUAL = (
 _CANDIDATE = flags.DEFINE_string(
     "candidate",
     None,
-    "what may replace it: a weights file, or planner:COMMAND, a program that plans",
+    "what may replace it: a weights file, your own cost (FILE.py:FUNCTION or FILE.so), "
+    "or planner:COMMAND, a program that plans",
     required=True,
 )
 _INCUMBENT = flags.DEFINE_string(
@@ -87,8 +89,9 @@ def main() -> None:
         tuned_idm=read_tuned_idm(Path(_IDM.value)) if _IDM.value else None,
         track=_FILTER.value,
     )
-    if job.own:
-        print(own_cost.words(checked_own_cost(job.own)))
+    for _, place in job.planners:
+        if isinstance(one := checked_planner(place), OwnCost):
+            print(words(one))
     if said := shared.idm_left_out(_IDM.value):
         print(said)
     sources = [open_dataset(url) for url in _DATA.value]
@@ -99,7 +102,7 @@ def main() -> None:
     files = {"candidate": _CANDIDATE.value, "incumbent": _INCUMBENT.value}
     facts = {"files": files, **found.facts, "made_by": provenance(job.weights)}
     if job.planners:
-        facts["planners"] = job.programs()
+        facts["planners"] = job.planner_facts()
     write_verdict(output, verdict, config, facts)
     print(format_verdict(verdict))
     print(f"written: {output}; exit status {verdict.exit_code}")

@@ -3,14 +3,15 @@
     rcirl simulate --weights=FILE[,FILE...] --suite=full|smoke|FAMILY --output=DIR
     rcirl simulate --weights=FILE --suite=recorded|heldout --data=DATASET --output=DIR
     rcirl simulate --planner="./my_planner --flag" --suite=smoke --output=DIR
+    rcirl simulate --planner=costs.py:my_cost --suite=smoke --output=DIR
 
 Every case is driven at 10 Hz; safety filter and candidates are the same for all
 rows. Writes table.txt, suite.json and cases.csv. A case is drawn by `rcirl replay`
 from its id. Held-out drives of datasets, up to 8 s among the recorded traffic, have the
 recorded human as one of the rows: `recorded` says the same of them as of the other
 suites, `heldout` how near to the human each row is (table.txt and likeness.json). A
-planner is any program that speaks the protocol of docs/own_process.md: its plans are
-followed as they are, behind no filter of ours.
+planner is an own cost (docs/own_cost.md), or any program that speaks the protocol of
+docs/own_process.md: its plans are followed as they are, behind no filter of ours.
 """
 
 from pathlib import Path
@@ -34,10 +35,11 @@ from rcirl_jax.evaluation.closed_loop.suite import (
 from rcirl_jax.evaluation.gate.types import DRIVES
 from rcirl_jax.export.closed_loop import (
     SuiteJob,
-    checked_program,
+    checked_planner,
     drive_by,
     read_tuned_idm,
 )
+from rcirl_jax.planner.own_cost import OwnCost, words
 from rcirl_jax.planner.program import processes_of
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
@@ -52,7 +54,10 @@ USUAL = (
 )
 _WEIGHTS = flags.DEFINE_list("weights", [], "weights files, with commas")
 _PLANNERS = flags.DEFINE_multi_string(
-    "planner", [], "command of a program that plans; may be given several times"
+    "planner",
+    [],
+    "your own cost (FILE.py:FUNCTION or FILE.so), or the command of a program that "
+    "plans; may be given several times",
 )
 _DATA = flags.DEFINE_list(
     "data", [], "datasets of --suite=recorded or heldout, with commas"
@@ -101,11 +106,12 @@ def main() -> None:
         dp=_DP.value,
         tuned_idm=read_tuned_idm(Path(_IDM.value)) if _IDM.value else None,
         track=_FILTER.value,
-        planners=tuple(("", command) for command in _PLANNERS.value),
+        planners=tuple(("", place) for place in _PLANNERS.value),
         mode=_MODE.value,
     )
-    for command in _PLANNERS.value:
-        checked_program(command)
+    for place in _PLANNERS.value:
+        if isinstance(one := checked_planner(place), OwnCost):
+            print(words(one))
     if said := shared.idm_left_out(_IDM.value):
         print(said)
     if of_data and places.workers > 1:
@@ -118,7 +124,7 @@ def main() -> None:
     # of the files as they are read, not hours later
     made_by, rows = provenance(_WEIGHTS.value), job.rows()
     if job.planners:
-        made_by["planners"] = job.programs()
+        made_by["planners"] = job.planner_facts()
     if of_data:
         data = open_datasets(_DATA.value)
         made_by["data_hash"] = data.hash

@@ -61,7 +61,13 @@ from rcirl_jax.planner.own_cost import (
     is_place,
     own_cost,
 )
-from rcirl_jax.planner.program import Program, check_program, is_program, program
+from rcirl_jax.planner.program import (
+    PREFIX,
+    Program,
+    check_program,
+    is_program,
+    program,
+)
 from rcirl_jax.planner.rank import (
     ONLINE,
     ONLINE_PATHS,
@@ -166,7 +172,6 @@ def table_rows(
     tuned_idm: Idm | None = None,
     names: Sequence[str] = (),
     track: str = "full",
-    own: str = "",
     planners: Sequence[tuple[str, str]] = (),
     mode: str | None = None,
 ) -> list[Row]:
@@ -174,10 +179,10 @@ def table_rows(
 
     Rows are named as by `row_names`, or bear `names`, one per file. The first drives
     again by `dp`. A tuned IDM comes last. `track` is the safety filter's
-    (`SafetyConfig`), `own` the place of the user's own cost, a baseline by its name.
-    `planners` are names of rows ("" for a program's own) and `planner.program` places.
-    Weights plan what they were trained to plan, other rows that rank candidates what
-    `mode` says or else the first file's; the rest plan speed along the given path.
+    (`SafetyConfig`). `planners` are names of rows ("" for their own) and places of
+    programs (`planner.program`) or own costs (`planner.own_cost`). Weights plan what
+    they were trained to plan, other rows that rank candidates what `mode` says or else
+    the first file's; the rest plan speed along the given path.
 
     Raises:
       InputError: no file and no planner, an unreadable one, one twice without `names`,
@@ -187,19 +192,25 @@ def table_rows(
     if not weights and not planners:
         raise InputError("weights: none: expected at least one file or planner")
     rewards = [open_reward(path) for path in weights]
-    user = own_cost_of(rewards, own)
-    configs = {
-        x: RankConfig(
-            sampler=own_sampler_of(rewards, grid),
-            safety=SafetyConfig(track=track, entry=x == "path_speed"),
-            own=user,
-        )
+    places = [place for _, place in planners if is_place(place)]
+    grids = {
+        x: own_sampler_of(rewards, grid)
         for x, grid in (("speed", ONLINE), ("path_speed", ONLINE_PATHS))
     }
+
+    def config_of(reward: Reward | None, mode: str) -> RankConfig:
+        own = own_cost_of([reward] if reward else [], places)
+        if own is None and places:  # drives in the same program
+            own = own_cost(places[0])
+        safety = SafetyConfig(track=track, entry=mode == "path_speed")
+        return RankConfig(sampler=grids[mode], safety=safety, own=own)
+
+    configs = [config_of(reward, reward.mode) for reward in rewards]
     rows = _learned_rows(rewards, names, configs)
     first = rewards[0] if rewards else None
     preset, params, activation = _program_of(first)
-    config = configs[mode or (first.mode if first else "speed")]
+    config = config_of(first, mode or (first.mode if first else "speed"))
+    in_speed = config_of(first, "speed")
     if dp and first is None:
         raise InputError("dp: without weights: expected a weights file")
     if dp and first is not None and first.mode != "speed":
@@ -210,14 +221,20 @@ def table_rows(
             "is no sum over points"
         )
     if dp:
-        policy = dp_policy(
-            feature_map(preset), activation, configs["speed"], DpConfig()
-        )
+        policy = dp_policy(feature_map(preset), activation, in_speed, DpConfig())
         every, name = max(plan_every, DP_EVERY), f"{rows[0].name} DP"
         row = Row(name=name, policy=policy, params=params, plan_every=every)
         rows.insert(1, row)
-    rows += [program_row(program(place), name) for name, place in planners]
-    by_name = {SPEED_DP_ROW: configs["speed"]}  # a cost of speed alone
+    for name, place in planners:
+        if is_place(place):
+            own = dataclasses.replace(config, own=own_cost(place))
+            row = baseline_row(own_cost(place).name, preset, params, own, activation)
+            is_taken = row.name in [one.name for one in rows]
+            name = name or (place if is_taken else row.name)
+            rows.append(dataclasses.replace(row, name=name))
+        else:
+            rows.append(program_row(program(place), name))
+    by_name = {SPEED_DP_ROW: in_speed}  # a cost of speed alone
     rows += [
         baseline_row(name, preset, params, by_name.get(name, config), activation)
         for name in baselines
@@ -225,10 +242,11 @@ def table_rows(
     if tuned_idm is not None:
         rows.append(rule_row(TUNED_IDM_ROW, "IDM", Yielding(idm=tuned_idm)))
     called = [row.name for row in rows]
-    for row in rows:
-        if row.program is not None and called.count(row.name) > 1:
+    of_planners = called[len(rewards) + dp :]
+    for (_, place), name in zip(planners, of_planners, strict=False):
+        if called.count(name) > 1:
             raise InputError(
-                f"planner: {row.program.command}: it is called {row.name}: expected "
+                f"planner: {place.removeprefix(PREFIX)}: it is called {name}: expected "
                 "another name than other rows'"
             )
     return rows
@@ -244,12 +262,12 @@ def _program_of(
 
 
 def _learned_rows(
-    rewards: Sequence[Reward], names: Sequence[str], configs: dict[str, RankConfig]
+    rewards: Sequence[Reward], names: Sequence[str], configs: Sequence[RankConfig]
 ) -> list[Row]:
     """One row a file, under distinct names."""
     rows: list[Row] = []
-    for reward, name in zip(rewards, names or row_names(rewards), strict=True):
-        config = configs[reward.mode]
+    called = names or row_names(rewards)
+    for reward, name, config in zip(rewards, called, configs, strict=True):
         seed = int(reward.provenance.get("seed") or 0)
         score, params = score_of(reward, config.own)
         policy = rank_policy(score, config)
@@ -270,8 +288,7 @@ class SuiteJob:
     names: tuple[str, ...] = ()  # of the learned rows; else after loss and shape
     tuned_idm: Idm | None = None  # of a further row
     track: str = "full"  # of the safety filter
-    own: str = ""  # place of the user's own cost
-    # programs that plan: names of their rows, "" for their own, and commands
+    # programs and own costs: names of their rows, "" for their own, and places
     planners: tuple[tuple[str, str], ...] = ()
     # a gate's candidate also at its highest gain everywhere, if its gain varies
     highest: bool = False
@@ -292,7 +309,6 @@ class SuiteJob:
             names=self.names,
             track=self.track,
             tuned_idm=self.tuned_idm,
-            own=self.own,
             planners=self.planners,
             mode=self.mode,
         )
@@ -305,10 +321,14 @@ class SuiteJob:
             rows.insert(1, more)
         return rows
 
-    def programs(self) -> dict[str, dict[str, str]]:
-        """The programs that plan, by command, for provenance."""
-        found = [program(place) for _, place in self.planners]
-        return {one.command: {"name": one.name, "sha256": one.sha256} for one in found}
+    def planner_facts(self) -> dict[str, dict[str, str]]:
+        """Name and sha256 of each planner by its place, for provenance."""
+        found = {}
+        for _, place in self.planners:
+            one = own_cost(place) if is_place(place) else program(place)
+            where = place.removeprefix(PREFIX)
+            found[where] = {"name": one.name, "sha256": one.sha256}
+        return found
 
     def cases(self) -> CaseSet:
         """The cases of the catalogue."""
@@ -399,9 +419,9 @@ def gate_job(
     """The suite that both drive, and the name of the incumbent's row.
 
     Args:
-      candidate: weights file, or a program that plans (`planner.program`).
-      incumbent: weights file, name of a baseline, place of an own cost
-        (`planner.own_cost`), or a program that plans.
+      candidate: weights file, place of an own cost (`planner.own_cost`), or a program
+        that plans (`planner.program`).
+      incumbent: one of these, or the name of a baseline.
       suite: full, smoke, or families with commas.
       cases: per family; None: as declared.
       duration_s: of a case; None: 120 s, smoke 20 s.
@@ -415,46 +435,47 @@ def gate_job(
     Raises:
       InputError: a duration, suite or count that cannot be.
     """
-    duration, own = case_duration(suite, duration_s), ""
-    if is_place(candidate):
-        raise InputError(
-            f"candidate: {candidate}: expected a weights file, or planner:COMMAND; an "
-            "own cost is the incumbent"
-        )
-    if is_place(incumbent):
-        own = incumbent
-        incumbent = checked_own_cost(own).name
-    named = {CANDIDATE: candidate, INCUMBENT: incumbent}
-    planners = {name: x for name, x in named.items() if is_program(x)}
-    for place in planners.values():
-        checked_program(place)
-    learned = not own and incumbent not in (*BASELINES, *planners.values())
+    duration = case_duration(suite, duration_s)
+    files: dict[str, str] = {}  # by name of the row, as planners
+    planners: list[tuple[str, str]] = []
+    rows = [*baselines]
+    if is_program(candidate) or is_place(candidate):
+        checked_planner(candidate)
+        planners.append((CANDIDATE, candidate))
+    else:
+        files[CANDIDATE] = candidate
+    name = INCUMBENT
     is_code = Path(incumbent).suffix in (".py", ".c", ".cc", ".cpp")
-    if learned and (is_code or not Path(incumbent).is_file()):
+    if is_place(incumbent):
+        name = checked_own_cost(incumbent).name
+        planners.append((name, incumbent))
+    elif is_program(incumbent):
+        checked_program(incumbent)
+        planners.append((INCUMBENT, incumbent))
+    elif incumbent in BASELINES:
+        name, rows = incumbent, [incumbent, *rows]
+    elif not is_code and Path(incumbent).is_file():
+        files[INCUMBENT] = incumbent
+    else:
         raise InputError(
             f"incumbent: {incumbent}: expected a weights file, FILE.py:FUNCTION or "
             f"FILE.so of an own cost, planner:COMMAND, or one of "
             f"{', '.join(BASELINES)}"
         )
-    theirs = learned or INCUMBENT in planners
-    names = [*baselines] if theirs else [incumbent, *baselines]
-    files = {CANDIDATE: candidate, **({INCUMBENT: incumbent} if learned else {})}
-    files = {name: x for name, x in files.items() if name not in planners}
     files |= beside or {}
     job = SuiteJob(
         weights=tuple(files.values()),
         names=tuple(files),
-        baselines=tuple(dict.fromkeys(names)),
+        baselines=tuple(dict.fromkeys(rows)),
         refs=suite_refs(suite, cases, catalogue_seed),
         duration_s=duration,
         plan_every=plan_every,
         tuned_idm=tuned_idm,
         track=track,
         highest=CANDIDATE in files,
-        own=own,
-        planners=tuple(planners.items()),
+        planners=tuple(planners),
     )
-    return job, INCUMBENT if theirs else incumbent
+    return job, name
 
 
 CHECKED_PER_FAMILY = 10  # scenes of a family that own costs and terms are asked about
@@ -554,6 +575,15 @@ def checked_sampler(config: SamplerConfig) -> SamplerConfig:
         made = draw(keys, scenes)
         check_own_sampler(config.own, config.mode == "speed", scenes, keys, made)
     return config
+
+
+def checked_planner(place: str) -> Program | OwnCost:
+    """The own cost or the program at a place, asked about scenes of the catalogue.
+
+    Raises:
+      InputError: there is none, or it gives no costs or plans.
+    """
+    return checked_own_cost(place) if is_place(place) else checked_program(place)
 
 
 @functools.cache

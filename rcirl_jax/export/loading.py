@@ -136,24 +136,26 @@ def scorer_of(reward: Reward) -> Scorer | PriorCostScorer:
     return PriorCostScorer(incumbent=reward.prior_cost.incumbent, total=reward.total)
 
 
-def own_cost_of(rewards: Sequence[Reward], place: str = "") -> OwnCost | None:
-    """Return the user's own cost that rewards are added to, or that of a place.
+def own_cost_of(
+    rewards: Sequence[Reward], places: Sequence[str] = ()
+) -> OwnCost | None:
+    """Return the user's own cost that rewards are added to.
 
     Args:
       rewards: each names in its provenance where its own cost was.
-      place: of an own cost that drives besides; "" for none.
+      places: of own costs that drive besides; the reward's may have moved there.
 
     Raises:
       InputError: two own costs; one that is not where it was, or has changed.
     """
-    found = {place: own_cost(place)} if place else {}
+    found: dict[str, OwnCost] = {}
+    here = {(cost.name, cost.sha256): cost for cost in map(own_cost, places)}
     for reward in rewards:
-        was = reward.provenance.get("own_cost")
-        if reward.prior_cost is None or not was:
+        was, prior_cost = reward.provenance.get("own_cost"), reward.prior_cost
+        if prior_cost is None or not was:
             continue
-        if found and next(iter(found.values())).sha256 == was["sha256"]:
-            continue  # the same, elsewhere
-        made = own_cost(was["place"])
+        moved = here.get((prior_cost.incumbent, was["sha256"]))
+        made = moved or own_cost(was["place"])
         if made.sha256 != was["sha256"]:
             raise InputError(
                 f"{reward.file}: own cost {was['place']}: it is no longer the one that "
@@ -162,8 +164,8 @@ def own_cost_of(rewards: Sequence[Reward], place: str = "") -> OwnCost | None:
         found[made.place] = made
     if len(found) > 1:
         raise InputError(
-            f"own cost: {', '.join(found)}: expected one for all rows of a table: a "
-            "weights file is compared with the own cost that it was tuned on"
+            f"own cost: {', '.join(found)}: expected one for all weights files: they "
+            "are ranked beside the own cost that they were tuned on"
         )
     return next(iter(found.values()), None)
 

@@ -12,7 +12,6 @@ is called back.
 
 import dataclasses
 import functools
-import hashlib
 import logging
 import sys
 import threading
@@ -27,7 +26,12 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.features.terms import NOT_TRACEABLE
 from rcirl_jax.runtime.answering import AnsweringProcess, NoAnswer
-from rcirl_jax.runtime.user_code import is_python, loaded, python_file
+from rcirl_jax.runtime.user_code import (
+    is_python,
+    loaded,
+    python_file,
+    source_sha256,
+)
 from rcirl_jax.types import Candidates, Scene
 
 CALL_S = 20.0  # s in which a process has to answer for a batch of scenes
@@ -51,7 +55,7 @@ class OwnCost:
     """An own cost by its place; small, hashable, can be sent to other processes."""
 
     place: str  # as given
-    sha256: str  # of the file
+    sha256: str  # of the file and what it imports of its folder
 
     @property
     def name(self) -> str:
@@ -108,13 +112,13 @@ def own_cost(place: str) -> OwnCost:
     """
     file = python_file(place) if is_python(place) else Path(place)
     try:
-        found = file.read_bytes()
+        sha256 = source_sha256(file)
     except OSError as error:
         raise InputError(
             f"own cost: {place}: {error.strerror}: expected FILE.py:FUNCTION or a "
             "library FILE.so"
         ) from error
-    made = OwnCost(place=place, sha256=hashlib.sha256(found).hexdigest())
+    made = OwnCost(place=place, sha256=sha256)
     if not 0 < len(made.name) <= LONGEST_NAME:
         raise InputError(
             f"own cost: {made.name}: expected a name of 1 to {LONGEST_NAME} characters"

@@ -47,6 +47,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.planner.plan import Plan, plan_of
 from rcirl_jax.runtime.answering import AnsweringProcess, NoAnswer
 from rcirl_jax.runtime.checked import checked
+from rcirl_jax.runtime.user_code import source_sha256
 from rcirl_jax.sampling import trajectory_on_path
 from rcirl_jax.types import Ego, Obstacles, Path, Scene
 from rcirl_jax.units import NUM_TIMES, STATION_STEP_M, TIMES_S, Kind
@@ -92,7 +93,7 @@ class Program:
     command: str
     name: str  # as it calls itself
     answer_s: float
-    sha256: str  # of the files that the command names
+    sha256: str  # of the files that the command names, and what they import
 
 
 class Refused(InputError):
@@ -121,7 +122,7 @@ def program(place: str) -> Program:
         file = pathlib.Path(shutil.which(word) or word)
         with contextlib.suppress(OSError):
             if file.is_file():
-                total.update(file.read_bytes())
+                total.update(source_sha256(file).encode())
     process, hello = _started(command)
     process.end()
     return Program(
@@ -145,7 +146,8 @@ def _started(command: str) -> tuple[AnsweringProcess, _Hello]:
         said = process.ask_line(msgspec.json.encode(about), START_S)
     except OSError as error:
         raise InputError(
-            f"{command}: {error.strerror}: expected a program that can be started"
+            f"{command}: {error.strerror}: expected a program that can be started, "
+            "or FILE.py:FUNCTION or FILE.so of an own cost"
         ) from error
     except NoAnswer as error:
         raise InputError(f"{command}: on start: {error}: {expected}") from error

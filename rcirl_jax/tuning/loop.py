@@ -243,7 +243,8 @@ def _said_of_weights(run: Run) -> str:
 
 def rows_of(job: SuiteJob) -> int:
     """Counts who drives: rewards, baselines, the tuned IDM and two who judge."""
-    return len(job.weights) + job.highest + len(job.baselines) + 3
+    learned, planners = len(job.weights) + job.highest, len(job.planners)
+    return learned + planners + len(job.baselines) + 3
 
 
 def work_of(

@@ -319,6 +319,7 @@ def simulate(run: Run, sources: Sequence[Dataset]) -> None:
     job, incumbent = suite_job(run)
     decides = {
         **dataclasses.asdict(job),
+        "planners": job.planner_facts(),
         "refs": digest([ref.id for ref in job.refs]),
         "weights": [file_sha256(Path(file)) for file in job.weights],
     }
@@ -373,6 +374,7 @@ def compare_choices(run: Run, sources: Sequence[Dataset]) -> None:
     inputs = {
         "weights": file_sha256(run.weights),
         "own_cost": name,
+        "planners": job.planner_facts(),
         "cases": [ref.id for ref in job.refs],
         "duration_s": job.duration_s,
         "plan_every": job.plan_every,
@@ -448,7 +450,6 @@ def turn_dial(run: Run, sources: Sequence[Dataset]) -> None:
         weights=tuple(map(str, files.values())),
         names=tuple(f"dial {x:g}" for x in files),
         baselines=(),
-        planners=(),
         tuned_idm=None,
         refs=tuple(job.refs[i] for i in at),
     )
@@ -466,7 +467,7 @@ def turn_dial(run: Run, sources: Sequence[Dataset]) -> None:
             save_with_dial(run.weights, x, file)
         drive, cases = drive_by(run.executor, job), job.cases()
         config = SuiteConfig(plan_every=job.plan_every)
-        drawn = dict(zip(files, job.rows(), strict=True))
+        drawn = dict(zip(files, job.rows(), strict=False))  # learned rows come first
         driven = {x: drive(row, cases, config) for x, row in drawn.items()}
         driven |= {
             x: jax.tree.map(lambda leaf: np.asarray(leaf)[at], runs.rows[name])

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.common import untrained
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.closed_loop import checked_own_cost
+from rcirl_jax.export.closed_loop import checked_own_cost, gate_job
 from rcirl_jax.planner import own_cost as module
 from rcirl_jax.planner.own_cost import OwnCost, check_own_cost, own_cost
 from rcirl_jax.planner.rank import ONLINE, RankConfig, rank_policy
@@ -137,6 +137,51 @@ def test_a_file_may_import_its_neighbours_and_have_dataclasses(tmp_path, monkeyp
         "    return Mine().jerk * candidates\n"
     )
     assert python_object(f"{tmp_path / 'cost.py'}:my_cost")(None, 4.0) == 2.0
+
+
+def version(folder, sign):
+    """The place of a cost in two files; as +velocity drives for a sign of -1."""
+    (folder / "parts").mkdir(parents=True)
+    (folder / "parts" / "weights.py").write_text(f"SPEED = {sign}\n")
+    (folder / "terms.py").write_text(
+        "from parts import weights\n"
+        "def speed(x):\n"
+        "    return weights.SPEED * x.v.mean(axis=1)\n"
+    )
+    (folder / "cost.py").write_text(
+        "import terms\n"
+        "def my_cost(scene, candidates):\n"
+        "    return terms.speed(candidates.trajectory)\n"
+    )
+    return f"{folder / 'cost.py'}:my_cost"
+
+
+def test_two_versions_of_an_own_cost_against_each_other(tmp_path):
+    new, old = version(tmp_path / "new", -1.0), version(tmp_path / "old", 1.0)
+    job, incumbent = gate_job(
+        new, old, suite="smoke", cases=None, duration_s=4.0, catalogue_seed=0,
+        plan_every=1, baselines=["+velocity", "IDM"],
+    )  # fmt: skip
+    rows = {row.name: row for row in job.rows()}
+    assert [*rows] == ["candidate", "my_cost", "+velocity", "IDM"]
+    assert incumbent == "my_cost"
+    fastest, slowest, velocity = (
+        driven(rows[name], 4.0).progress
+        for name in ("candidate", incumbent, "+velocity")
+    )
+    np.testing.assert_array_equal(fastest, velocity)
+    assert np.all(slowest < fastest - 1.0)
+    assert [*job.planner_facts()] == [new, old]
+
+
+def test_a_change_of_what_a_file_imports_is_a_change_of_the_cost(tmp_path):
+    place = version(tmp_path / "new", -1.0)
+    hashes = {own_cost.__wrapped__(place).sha256}
+    for name in ("unread.py", "terms.py", "parts/weights.py"):
+        with (tmp_path / "new" / name).open("a") as file:
+            file.write("# changed\n")
+        hashes.add(own_cost.__wrapped__(place).sha256)
+    assert len(hashes) == 3  # what is not imported does not count
 
 
 def test_a_library_without_the_functions(tmp_path, some):

@@ -244,6 +244,6 @@ def test_a_gate_of_two_programs(in_cpp):
     job, incumbent = gate_job(place, "hand-set", **settings)
     assert [row.name for row in job.rows()] == ["candidate", "hand-set", "IDM"]
     assert checked_program(place).name == "IDM in C++"
-    assert list(job.programs()) == [in_cpp]
+    assert list(job.planner_facts()) == [in_cpp]
     with pytest.raises(InputError, match="No such file or directory"):
         gate_job("planner:./nowhere", "hand-set", **settings)
