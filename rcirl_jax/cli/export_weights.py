@@ -109,7 +109,12 @@ def main() -> None:
         theirs, output = Path(_INTO.value), Path(_OUTPUT.value)
         try:
             text = theirs.read_text("utf-8")
-        except (OSError, ValueError) as error:
+        except OSError as error:
+            raise InputError(
+                f"--into: {theirs}: {error.strerror}: expected your planner's "
+                "parameter file"
+            ) from error
+        except ValueError as error:
             raise InputError(f"--into: {theirs}: {error}: expected text") from error
         write_whole(
             output, with_weights(text, open_reward(_WEIGHTS.value), str(theirs))

@@ -317,6 +317,7 @@ def _line(flag: flags.Flag) -> str:
     """A flag, what it is and its default, in as few lines as it takes."""
     name = f"  --{'[no]' if flag.boolean else ''}{flag.name}"
     said = re.sub(r"^<.*?>: ", "", str(flag.help))  # absl's list of an enum's values
+    said = said.partition(";\n")[0]  # absl's words on flags that may be repeated
     default = ""
     if said.endswith(AS_SAID):
         # of a command with recipes; the others start without loading them

@@ -443,9 +443,8 @@ def gate_job(
         checked_planner(candidate)
         planners.append((CANDIDATE, candidate))
     else:
-        files[CANDIDATE] = candidate
+        files[CANDIDATE] = weights_file(candidate, "candidate")
     name = INCUMBENT
-    is_code = Path(incumbent).suffix in (".py", ".c", ".cc", ".cpp")
     if is_place(incumbent):
         name = checked_own_cost(incumbent).name
         planners.append((name, incumbent))
@@ -454,14 +453,8 @@ def gate_job(
         planners.append((INCUMBENT, incumbent))
     elif incumbent in BASELINES:
         name, rows = incumbent, [incumbent, *rows]
-    elif not is_code and Path(incumbent).is_file():
-        files[INCUMBENT] = incumbent
     else:
-        raise InputError(
-            f"incumbent: {incumbent}: expected a weights file, FILE.py:FUNCTION or "
-            f"FILE.so of an own cost, planner:COMMAND, or one of "
-            f"{', '.join(BASELINES)}"
-        )
+        files[INCUMBENT] = weights_file(incumbent, "incumbent", BASELINES)
     files |= beside or {}
     job = SuiteJob(
         weights=tuple(files.values()),
@@ -476,6 +469,22 @@ def gate_job(
         planners=tuple(planners),
     )
     return job, name
+
+
+def weights_file(name: str, what: str, others: Sequence[str] = ()) -> str:
+    """Returns the name of a file that may be weights.
+
+    Raises:
+      InputError: there is none, or it is code; says what else `what` may be.
+    """
+    is_there = Path(name).is_file()
+    if is_there and Path(name).suffix not in (".py", ".c", ".cc", ".cpp", ".so"):
+        return name
+    kinds = ["a weights file", "FILE.py:FUNCTION or FILE.so of an own cost"]
+    kinds += ["planner:COMMAND", *others]
+    missing = "" if is_there else "no such file: "
+    known = f"{', '.join(kinds[:-1])} or {kinds[-1]}"
+    raise InputError(f"{what}: {name}: {missing}expected {known}")
 
 
 CHECKED_PER_FAMILY = 10  # scenes of a family that own costs and terms are asked about

@@ -355,7 +355,8 @@ def load_weights(path: str | os.PathLike[str]) -> Reward:
             # One byte more than allowed: an oversize file is seen, not read.
             data = stream.read(MAX_FILE_BYTES + 1)
     except (OSError, TypeError, ValueError) as error:
-        raise WeightsError(f"{path}: path: {error}: expected a file") from None
+        why = getattr(error, "strerror", None) or error
+        raise WeightsError(f"{path}: path: {why}: expected a file") from None
     return decode_weights(data, file)
 
 

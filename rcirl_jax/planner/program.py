@@ -45,7 +45,7 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.plan import Plan, plan_of
-from rcirl_jax.runtime.answering import AnsweringProcess, NoAnswer
+from rcirl_jax.runtime.answering import AnsweringProcess, NoAnswer, TooLate
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.runtime.user_code import source_sha256
 from rcirl_jax.sampling import trajectory_on_path
@@ -63,6 +63,7 @@ BACK_M = 1e-3  # m of rounding by which a station may be behind the one before
 SHOWN = 80  # characters of an answer in a line on it
 NO_CASE = 2**32 - 1  # number of a scene that is of no case
 EXPECTED = 'expected {"s": [18 stations, m]}'
+LATER = 'a program may ask for more time on start, by "answer_s" of'
 EGO, ROAD = tuple(Ego.__dataclass_fields__), tuple(Path.__dataclass_fields__)
 AT_START = ("kind", "a", "l_dot")  # of an obstacle; all else is at the times
 BOXES = tuple(x for x in Obstacles.__dataclass_fields__ if x not in AT_START)
@@ -302,7 +303,9 @@ class _Seat:
         try:
             said = self._process.ask_line(one.line, self._program.answer_s)
         except NoAnswer as error:
-            raise InputError(f"{one.where}: {error}: {EXPECTED}") from error
+            late = isinstance(error, TooLate)
+            more = f"; {LATER} at most {LONGEST_S:g}" if late else ""
+            raise InputError(f"{one.where}: {error}: {EXPECTED}{more}") from error
         self._tells.took(time.perf_counter() - begin)
         return plan_in(said, one.where)
 

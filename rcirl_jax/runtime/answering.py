@@ -25,6 +25,10 @@ class NoAnswer(Exception):
     """Says why a program gave no answer; it has been ended."""
 
 
+class TooLate(NoAnswer):
+    """Says that none came in time."""
+
+
 def packed(arrays: Mapping[str, np.ndarray]) -> bytes:
     """Named arrays as an npz after its length."""
     file = io.BytesIO()
@@ -107,7 +111,7 @@ class AnsweringProcess:
             yield
         except TimeoutError:
             self.end()
-            raise NoAnswer(f"no answer in {limit:g} s") from None
+            raise TooLate(f"no answer in {limit:g} s") from None
         except (EOFError, BrokenPipeError):
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(1.0)

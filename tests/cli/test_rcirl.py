@@ -172,6 +172,7 @@ def test_another_broken_pipe_is_one_line(monkeypatch, capfd):
 def test_help_fits_and_has_the_usual_flags_only(name, every):
     short, full, _ = every[name]
     assert fits(short), short
+    assert not re.search(r"\w;? {2,}\w", re.sub(FLAG, "", full)), full
     assert f"    rcirl {name} --" in short
     usual, flags = FLAG.findall(short), FLAG.findall(full)
     assert flags[: len(usual)] == usual
