@@ -443,7 +443,7 @@ def gate_job(
         checked_planner(candidate)
         planners.append((CANDIDATE, candidate))
     else:
-        files[CANDIDATE] = weights_file(candidate, "candidate")
+        files[CANDIDATE] = candidate  # which a tuning has yet to make
     name = INCUMBENT
     if is_place(incumbent):
         name = checked_own_cost(incumbent).name
@@ -654,6 +654,8 @@ def judged(
     """
     if drives < 1:
         raise InputError(f"drives: {drives}: expected at least 1")
+    if CANDIDATE in job.names:
+        weights_file(job.weights[job.names.index(CANDIDATE)], CANDIDATE)
     result, report = drive_job(job, executor), None
     if sources:
         recorded = held_out(sources, drives)
