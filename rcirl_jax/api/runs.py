@@ -20,7 +20,13 @@ from rcirl_jax.evaluation.gate.verdict import write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
 from rcirl_jax.evaluation.ranking.evaluate import evaluate_ranking
 from rcirl_jax.evaluation.ranking.report import RankingReport, format_table
-from rcirl_jax.export.closed_loop import SuiteJob, gate_job, judged, run_job
+from rcirl_jax.export.closed_loop import (
+    SuiteJob,
+    gate_baselines,
+    gate_job,
+    judged,
+    run_job,
+)
 from rcirl_jax.export.loading import load_runs, open_reward
 from rcirl_jax.runtime.executors import Executor, Serial
 from rcirl_jax.runtime.pipeline import only_one
@@ -184,10 +190,7 @@ def gate(
         duration_s=duration_s,
         catalogue_seed=0,
         plan_every=1,
-        baselines=(
-            "IDM",
-            *(name for name in config.trivial_baselines if name in BASELINES),
-        ),
+        baselines=gate_baselines(os.fspath(candidate), config),
     )
     sources = [
         one if isinstance(one, Dataset) else open_dataset(one) for one in _each(data)

@@ -26,13 +26,14 @@ from rcirl_jax.evaluation.gate.verdict import write_verdict
 from rcirl_jax.evaluation.gate.words import format_verdict
 from rcirl_jax.export.closed_loop import (
     checked_planner,
+    gate_baselines,
     gate_job,
     judged,
     read_tuned_idm,
 )
 from rcirl_jax.planner.own_cost import OwnCost, words
 from rcirl_jax.planner.safety import TRACKS
-from rcirl_jax.simulation.rows import BASELINES
+from rcirl_jax.simulation.rows import KNOWN_BASELINES
 
 USUAL = (
     *("candidate", "incumbent", "output", "data", "drives", "suite", "cases"),
@@ -49,7 +50,8 @@ _INCUMBENT = flags.DEFINE_string(
     "incumbent",
     "hand-set",
     "what drives today: a weights file, your own cost (FILE.py:FUNCTION or FILE.so), "
-    "planner:COMMAND, a program that plans, or a baseline: " + ", ".join(BASELINES),
+    "planner:COMMAND, a program that plans, or a baseline: "
+    + ", ".join(KNOWN_BASELINES),
 )
 _OUTPUT = flags.DEFINE_string(
     "output", None, "JSON of the verdict to write", required=True
@@ -82,10 +84,7 @@ def main() -> None:
         _CANDIDATE.value,
         _INCUMBENT.value,
         **_SUITE.settings(),
-        baselines=(
-            "IDM",
-            *(name for name in config.trivial_baselines if name in BASELINES),
-        ),
+        baselines=gate_baselines(_CANDIDATE.value, config),
         tuned_idm=read_tuned_idm(Path(_IDM.value)) if _IDM.value else None,
         track=_FILTER.value,
     )

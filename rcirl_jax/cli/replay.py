@@ -14,7 +14,7 @@ from absl import flags
 from rcirl_jax.cli.running import provenance
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.report.replays import make_replays
-from rcirl_jax.simulation.rows import BASELINES, Row
+from rcirl_jax.simulation.rows import KNOWN_BASELINES, Row
 from rcirl_jax.simulation.suite import (
     FULL_S,
     case_duration,
@@ -29,14 +29,16 @@ _WEIGHTS = flags.DEFINE_string(
 _CASE = flags.DEFINE_string(
     "case", None, "id in a report or cases.csv, as cut_in/017@0", required=True
 )
-_ROW = flags.DEFINE_enum("row", "learned", ["learned", "dp", *BASELINES], "who drives")
+_ROW = flags.DEFINE_enum(
+    "row", "learned", ["learned", "dp", *KNOWN_BASELINES], "who drives"
+)
 _DURATION = flags.DEFINE_float("duration", FULL_S, "s of the drive, 1 to 120")
 _EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans", 1)
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
 
 
 def _row() -> Row:
-    names = [_ROW.value] if _ROW.value in BASELINES else []
+    names = [_ROW.value] if _ROW.value in KNOWN_BASELINES else []
     wants_dp = _ROW.value == "dp"
     rows = table_rows([_WEIGHTS.value], names, _EVERY.value, dp=wants_dp)
     return rows[0] if _ROW.value == "learned" else rows[1]

@@ -39,13 +39,14 @@ from rcirl_jax.export.closed_loop import (
     drive_by,
     read_tuned_idm,
 )
+from rcirl_jax.export.loading import open_reward
 from rcirl_jax.planner.own_cost import OwnCost, words
 from rcirl_jax.planner.program import processes_of
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
 from rcirl_jax.sampling.sampler import MODES
 from rcirl_jax.simulation.recorded import held_out
-from rcirl_jax.simulation.rows import BASELINES, human_row
+from rcirl_jax.simulation.rows import BASELINES, baselines_of, human_row
 from rcirl_jax.simulation.suite import case_duration, recorded_set, suite_refs
 
 USUAL = (
@@ -64,7 +65,10 @@ _DATA = flags.DEFINE_list(
 )
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
 _BASELINES = flags.DEFINE_list(
-    "baselines", ",".join(BASELINES), "baselines that drive too; fewer are quicker"
+    "baselines",
+    ",".join(BASELINES),
+    "baselines that drive too; fewer are quicker; IDM + MOBIL too where paths are "
+    "planned",
 )
 _IDM = flags.DEFINE_string(
     "tuned_idm", None, "RUN/tuned_idm.json of autotune: a tuned IDM drives too"
@@ -99,7 +103,9 @@ def main() -> None:
         raise InputError(f"--cases: {cases}: expected at least 1")
     job = SuiteJob(
         weights=tuple(_WEIGHTS.value),
-        baselines=tuple(_BASELINES.value),
+        baselines=tuple(
+            _BASELINES.value if _BASELINES.present else baselines_of(_mode())
+        ),
         refs=() if of_data else suite_refs(suite, cases, seed),
         duration_s=case_duration(suite, asked["duration_s"]),
         plan_every=asked["plan_every"],
@@ -152,6 +158,12 @@ def main() -> None:
     print(f"peak memory: {result.facts['peak_memory_gib']} GiB")
     print(f"look first at: {', '.join(worst_cases(result, rows[0].name, 5))}")
     print(f"written: {_OUTPUT.value}/table.txt, suite.json, cases.csv")
+
+
+def _mode() -> str:
+    """What baselines that rank candidates plan."""
+    files = _WEIGHTS.value
+    return _MODE.value or (open_reward(files[0]).mode if files else "speed")
 
 
 def _likeness(report: LikenessReport, made_by: dict) -> None:

@@ -55,6 +55,7 @@ from rcirl_jax.export.weights import PROVENANCE_KEYS
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm, Yielding
 from rcirl_jax.planner.dp import DpConfig, dp_policy
+from rcirl_jax.planner.mobil import MOBIL_ROW
 from rcirl_jax.planner.own_cost import (
     OwnCost,
     check_own_cost,
@@ -70,17 +71,16 @@ from rcirl_jax.planner.program import (
 )
 from rcirl_jax.planner.rank import (
     ONLINE,
-    ONLINE_PATHS,
     Params,
     RankConfig,
     Ranking,
     Score,
     hand_score,
+    online,
     rank_policy,
     ranking,
     ranking_score,
 )
-from rcirl_jax.planner.safety import SafetyConfig
 from rcirl_jax.reward import RewardConfig, fit_normaliser, init_params, seen_range
 from rcirl_jax.reward.speed_dp import SPEED_DP_ROW
 from rcirl_jax.runtime.atomic_files import read_json, write_json
@@ -93,7 +93,7 @@ from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.simulation.recorded import held_out
 from rcirl_jax.simulation.rollout import LANES, first_scenes
 from rcirl_jax.simulation.rows import (
-    BASELINES,
+    KNOWN_BASELINES,
     Row,
     baseline_row,
     drawn_weights,
@@ -193,17 +193,13 @@ def table_rows(
         raise InputError("weights: none: expected at least one file or planner")
     rewards = [open_reward(path) for path in weights]
     places = [place for _, place in planners if is_place(place)]
-    grids = {
-        x: own_sampler_of(rewards, grid)
-        for x, grid in (("speed", ONLINE), ("path_speed", ONLINE_PATHS))
-    }
+    sampler = own_sampler_of(rewards, SamplerConfig())
 
     def config_of(reward: Reward | None, mode: str) -> RankConfig:
         own = own_cost_of([reward] if reward else [], places)
         if own is None and places:  # drives in the same program
             own = own_cost(places[0])
-        safety = SafetyConfig(track=track, entry=mode == "path_speed")
-        return RankConfig(sampler=grids[mode], safety=safety, own=own)
+        return online(dataclasses.replace(sampler, mode=mode), track, own)
 
     configs = [config_of(reward, reward.mode) for reward in rewards]
     rows = _learned_rows(rewards, names, configs)
@@ -386,6 +382,19 @@ def run_job(job: SuiteJob, executor: Executor) -> SuiteResult:
     return run_suite(job.rows(), job.cases(), config, drive_by(executor, job))
 
 
+def gate_baselines(candidate: str, config: GateConfig) -> tuple[str, ...]:
+    """Returns a gate's baselines: IDM, MOBIL if paths are planned, trivial ones.
+
+    Args:
+      candidate: weights file, or a program that plans.
+      config: names the trivial ones.
+    """
+    learned = not is_program(candidate) and Path(candidate).is_file()
+    steers = learned and open_reward(candidate).mode == "path_speed"
+    trivial = [name for name in config.trivial_baselines if name in KNOWN_BASELINES]
+    return ("IDM", *([MOBIL_ROW] if steers else []), *trivial)
+
+
 def write_tuned_idm(path: Path, idm: Idm) -> None:
     """Write the file, whole or not at all."""
     write_json(path, {name: float(getattr(idm, name)) for name in FIELDS})
@@ -451,10 +460,10 @@ def gate_job(
     elif is_program(incumbent):
         checked_program(incumbent)
         planners.append((INCUMBENT, incumbent))
-    elif incumbent in BASELINES:
+    elif incumbent in KNOWN_BASELINES:
         name, rows = incumbent, [incumbent, *rows]
     else:
-        files[INCUMBENT] = weights_file(incumbent, "incumbent", BASELINES)
+        files[INCUMBENT] = weights_file(incumbent, "incumbent", KNOWN_BASELINES)
     files |= beside or {}
     job = SuiteJob(
         weights=tuple(files.values()),
@@ -498,7 +507,7 @@ def checked_own_cost(place: str) -> OwnCost:
       InputError: there is none, or no planner could rank by it (`check_own_cost`).
     """
     cost = own_cost(place)
-    check_own_cost(cost, *_asked_about(), BASELINES)
+    check_own_cost(cost, *_asked_about(), KNOWN_BASELINES)
     return cost
 
 
@@ -669,10 +678,11 @@ def judged(
     return Judged(verdict=verdict, likeness=report, facts=facts)
 
 
-def suite_facts(job: SuiteJob) -> dict[str, str]:
-    """Returns what a verdict states of the suite: the hash of its families' files."""
+def suite_facts(job: SuiteJob) -> dict[str, object]:
+    """Returns what a verdict states of the suite: files' hash, who plans paths."""
     names = dict.fromkeys(ref.family for ref in job.refs)
-    return {"families_sha256": families_sha256(names)}
+    paths = [row.name for row in job.rows() if row.steers]
+    return {"families_sha256": families_sha256(names), "plan_paths": paths}
 
 
 def left_out(job: SuiteJob) -> str:

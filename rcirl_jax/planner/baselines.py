@@ -312,7 +312,7 @@ def _careful(braking: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
     return driven
 
 
-def _behind_the_nearest(scene: Scene, driver: Yielding) -> jax.Array:
+def behind_the_nearest(scene: Scene, driver: Yielding) -> jax.Array:
     """IDM behind the nearest body or line in the ego's corridor now."""
     obstacles, ego = scene.obstacles, scene.ego
     front = ego.s + 0.5 * ego.length
@@ -337,7 +337,7 @@ def _behind_the_nearest(scene: Scene, driver: Yielding) -> jax.Array:
 # (scene, driver) -> acceleration [] m/s^2
 RULES = {
     "constant speed": lambda scene, driver: jnp.zeros(()),
-    "IDM": _behind_the_nearest,
+    "IDM": behind_the_nearest,
     "IDM yielding": acceleration,
     "CC": _careful(cc_braking),
     "FSM": _careful(fsm_braking),

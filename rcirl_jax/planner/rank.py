@@ -95,6 +95,24 @@ class RankConfig:
         return self.sampler.mode == "path_speed"
 
 
+def online(
+    sampler: SamplerConfig, track: str = "full", own: OwnCost | None = None
+) -> RankConfig:
+    """Returns the closed loop's settings for the mode of a sampler.
+
+    Args:
+      sampler: names the mode, and the user's own candidates if there are any.
+      track: of the safety filter.
+      own: the user's own cost.
+    """
+    steers = sampler.mode == "path_speed"
+    return RankConfig(
+        sampler=sampler.on_own(ONLINE_PATHS if steers else ONLINE),
+        safety=SafetyConfig(track=track, entry=steers),
+        own=own,
+    )
+
+
 def value_rows(
     model: RewardModel,
     params: RewardParams,

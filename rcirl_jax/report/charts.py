@@ -30,7 +30,7 @@ from rcirl_jax.report.style import (
     svg,
 )
 from rcirl_jax.simulation.metrics import COLUMNS
-from rcirl_jax.simulation.rows import BASELINES
+from rcirl_jax.simulation.rows import KNOWN_BASELINES
 
 LEARNED = CLASS_COLOURS["follow"]
 BASELINE = "#777777"
@@ -44,7 +44,7 @@ CURVES = (
     CLASS_COLOURS["other"],
     "#777777",
 )
-NOT_LEARNED = {*BASELINE_ROWS, *BASELINES}
+NOT_LEARNED = {*BASELINE_ROWS, *KNOWN_BASELINES}
 PANELS = {
     "top1_fde": ("distance of the chosen at the horizon", "m, lower is better"),
     "top3_fde": ("best of the three highest", "m, lower is better"),

@@ -615,12 +615,13 @@ def _provenance(report: TuningReport) -> dict:
             name,
             reward.file,
             reward.provenance.get("seed", "not said"),
+            reward.mode,
             reward.provenance.get("git_commit", "not said"),
             reward.sha256,
         )
         for name, reward in report.rewards.items()
     ]
-    heads = ("reward", "file", "seed", "commit", "sha256")
+    heads = ("reward", "file", "seed", "mode", "commit", "sha256")
     return {
         "table": Table(caption="Weights", heads=heads, rows=files, kind="wrap"),
         "text": facts_text({"dataset_sha256": report.dataset.hash, **report.facts}),

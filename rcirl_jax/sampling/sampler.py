@@ -207,6 +207,17 @@ def num_candidates(config: SamplerConfig) -> int:
     return _pairs(config)[0].size
 
 
+def as_planned(scene: Scene, config: SamplerConfig) -> Scene:
+    """Returns a scene without its given path, where paths are planned.
+
+    The path of a scene from a log is the one that the human took, which would tell the
+    planner where to go. Instead it gets the reference line, as in closed loop.
+    """
+    if config.mode == "speed":
+        return scene
+    return scene.replace(path=scene.path.replace(l=jnp.zeros_like(scene.path.l)))
+
+
 def sample(key: jax.Array, scene: Scene, config: SamplerConfig) -> Candidates:
     """K candidate trajectories of one scene.
 
@@ -221,6 +232,7 @@ def sample(key: jax.Array, scene: Scene, config: SamplerConfig) -> Candidates:
       those that keep the offset or the lane.
     """
     with jax.named_scope("sampling"):
+        scene = as_planned(scene, config)
         stations = speed_profiles(key, scene, config)
         family = jnp.asarray(_speed_families(config))
         keeps = True

@@ -103,8 +103,10 @@ def _rows(
             continue
         origin = np.interp(now, clock, s)
         row = _flat(jax.tree.map(lambda x, at=frame: np.asarray(x[at]), scenes))
+        # 0 along given paths, else the middle of the lane that offsets are from
+        middle = l[round(now / STEP_S) - 1] - row["ego.l"]
         row["human.s"] = np.interp(now + TIMES_S, clock, s) - origin
-        row["human.l"] = np.interp(now + TIMES_S, clock, l)
+        row["human.l"] = np.interp(now + TIMES_S, clock, l) - middle
         row["future_s"] = HORIZON_S
         row["s_at_5s"] = float(np.interp(now + 5.0, clock, s) - origin)
         row["frame"] = round(now / STEP_S)

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
@@ -28,6 +29,7 @@ from rcirl_jax.planner.baselines import (
     rule,
     rule_policy,
 )
+from rcirl_jax.planner.mobil import MOBIL_ROW, Mobil, mobil_policy
 from rcirl_jax.planner.program import Program, ProgramPolicy
 from rcirl_jax.planner.rank import (
     Params,
@@ -53,6 +55,12 @@ BASELINES = (
     *("hand-set", SPEED_DP_ROW, "IDM", "IDM yielding"),
     *("constant speed", "random weights", *TRIVIAL_BASELINES),
 )
+KNOWN_BASELINES = (*BASELINES, MOBIL_ROW)  # the last one changes lanes
+
+
+def baselines_of(mode: str) -> tuple[str, ...]:
+    """Returns the baselines that stand beside planners of a mode of the sampler."""
+    return KNOWN_BASELINES if mode == "path_speed" else BASELINES
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -105,6 +113,12 @@ def rule_row(
     return Row(name=name, policy=rule_policy, params=rule(of, driver), **how)
 
 
+def mobil_row() -> Row:
+    """The driver that changes lanes by MOBIL."""
+    numbers = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), Mobil())
+    return Row(name=MOBIL_ROW, policy=mobil_policy, params=numbers)
+
+
 def program_row(one: Program, name: str = "") -> Row:
     """A planner that is a program, under its own name or another."""
     return Row(name=name or one.name, policy=ProgramPolicy(one))
@@ -136,7 +150,7 @@ def baseline_row(
     config: RankConfig,
     activation: str = RewardConfig().activation,
 ) -> Row:
-    """A baseline by its name in `BASELINES`.
+    """A baseline by its name in `KNOWN_BASELINES`.
 
     Args:
       name: which one; or that of the user's own cost, `config.own`.
@@ -146,11 +160,13 @@ def baseline_row(
       config: of the ranking planner.
       activation: of the learned reward.
     """
-    known = [*BASELINES, *([config.own.name] if config.own else [])]
+    known = [*KNOWN_BASELINES, *([config.own.name] if config.own else [])]
     if name not in known:
         raise InputError(f"baselines: {name}: expected some of {', '.join(known)}")
     if name in RULES:
         return rule_row(name, name)
+    if name == MOBIL_ROW:
+        return mobil_row()
     if name == "random weights":
         drawn, _ = drawn_weights(preset)
         usual = RewardConfig().activation

@@ -17,7 +17,7 @@ from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.features.columns import Frame
 from rcirl_jax.features.mapping import candidate_frames
 from rcirl_jax.planner.prediction import select_future, with_predicted_futures
-from rcirl_jax.planner.rank import own_score
+from rcirl_jax.planner.rank import online, own_score
 from rcirl_jax.planner.safety import check
 from rcirl_jax.reward import CandidateInfo
 from rcirl_jax.reward.network import matmul_f32
@@ -28,7 +28,7 @@ from rcirl_jax.sampling import (
     trajectory_from_positions,
     trajectory_on_path,
 )
-from rcirl_jax.sampling.sampler import family_index
+from rcirl_jax.sampling.sampler import as_planned, family_index
 from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig
 from rcirl_jax.types import Candidates, Demonstration, Scene, Tag, Trajectory
 from rcirl_jax.units import TIMES_S
@@ -112,7 +112,8 @@ def featurise(
 
     def one(index: jax.Array, demonstration: Demonstration) -> tuple:
         own_key = jax.random.fold_in(key, index)
-        scene = _slowed(own_key, demonstration.scene, config.slowed)
+        scene = as_planned(demonstration.scene, config.sampler)
+        scene = _slowed(own_key, scene, config.slowed)
         scene = _under_futures(own_key, scene, config.futures)
         demonstration = demonstration.replace(scene=scene)
         valid = demonstration.scene.time_valid & seen
@@ -325,7 +326,7 @@ def admitted(scene: Scene, candidates: Candidates, config: TrainConfig) -> jax.A
     """
     if config.admissible_in == "none":
         return jnp.ones(candidates.feasible.shape, bool)
-    passed = check(scene, candidates).admissible
+    passed = check(scene, candidates, online(config.sampler).safety).admissible
     if config.admissible_in == "simulated":
         passed = passed | ~scene.tags[Tag.SIMULATED]
     return passed

@@ -28,10 +28,10 @@ from rcirl_jax.data.store.dataset import (
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import checked_own_cost, table_rows
 from rcirl_jax.planner.own_cost import is_place
-from rcirl_jax.planner.rank import ONLINE, Params, Policy, RankConfig
+from rcirl_jax.planner.rank import Params, Policy, online
 from rcirl_jax.runtime.pipeline import digest, file_sha256
 from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
-from rcirl_jax.simulation.rows import baseline_row, drawn_weights
+from rcirl_jax.simulation.rows import baseline_row, drawn_weights, mobil_row
 from rcirl_jax.simulation.suite import suite_refs
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.tuning.prior_cost import fit_prior_cost
@@ -119,7 +119,7 @@ def _round(run: Run, number: int, learner: Path | None) -> Dataset:
         "number": number,
         "expert": run.incumbent_hash() if plan.expert != "driver model" else "",
         "learner": file_sha256(learner) if learner else "",
-        "sampler": run.config.train.sampler.own_sha256,
+        **run.candidates,
     }
     key = digest({**inputs, **run.code()})[:8]
     folder = run.folder / f"demonstrations-{key}" / str(number)
@@ -155,6 +155,8 @@ def expert_of(
 ) -> tuple[Policy, Params] | None:
     """Returns the expert as a policy and its weights; None: the driver models.
 
+    Where paths are planned the driver model is the one that changes lanes.
+
     Args:
       plan: names the expert.
       incumbent: weights file, "hand-set" or the place of an own cost, which is the
@@ -165,14 +167,17 @@ def expert_of(
       InputError: a file cannot be read.
     """
     if plan.expert == "driver model":
-        return None
+        if config.sampler.mode == "speed":
+            return None
+        row = mobil_row()
+        return row.policy, row.params
     if plan.expert == "own cost" or incumbent == "hand-set" or is_place(incumbent):
         own = checked_own_cost(incumbent) if is_place(incumbent) else None
         row = baseline_row(
             own.name if own else "hand-set",
             config.features,
             drawn_weights(config.features, config.reward),
-            RankConfig(sampler=config.sampler.on_own(ONLINE), own=own),
+            online(config.sampler, own=own),
             config.reward.activation,
         )
     else:

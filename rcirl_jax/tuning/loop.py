@@ -88,6 +88,8 @@ def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
     _check_incumbent(run)
     if checked_sampler(run.config.train.sampler).own:
         run.say(f"candidates: {run.config.train.sampler.own}")
+    if run.steers:
+        run.say("mode: path_speed: paths are learned, planned and judged too")
     if run.own_cost:
         run.say(own_cost.words(run.own_cost))
     with compiles() as compiled:

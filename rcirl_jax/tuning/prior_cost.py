@@ -27,9 +27,10 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.score import candidates_key
 from rcirl_jax.export.reader import PriorCost
 from rcirl_jax.features import FeatureMap, feature_map
+from rcirl_jax.planner.baselines import constant_speed_trajectory
 from rcirl_jax.planner.own_cost import OwnCost
 from rcirl_jax.planner.prediction import with_predicted_futures
-from rcirl_jax.planner.rank import ONLINE, Score, hand_score, own_score
+from rcirl_jax.planner.rank import ONLINE, Score, hand_score, online, own_score
 from rcirl_jax.reward.familiarity import (
     UNITS,
     Familiarity,
@@ -37,12 +38,11 @@ from rcirl_jax.reward.familiarity import (
     of_the_scene,
 )
 from rcirl_jax.runtime.atomic_files import read_json, write_json
-from rcirl_jax.sampling import SamplerConfig, sample, trajectory_on_path
-from rcirl_jax.sampling.sampler import as_candidates
+from rcirl_jax.sampling import SamplerConfig, sample
+from rcirl_jax.sampling.sampler import as_candidates, as_planned
 from rcirl_jax.tuning.recipes import PriorCostConfig
 from rcirl_jax.tuning.run import Run
 from rcirl_jax.types import Scene
-from rcirl_jax.units import TIMES_S
 
 OWN_COST = "hand-set"  # stands for the planner's own cost where none is given
 COMPARED_SCENES = 256  # training scenes of each source in which costs are compared
@@ -83,10 +83,12 @@ def fitted_prior_cost(
       own: the user's own cost; None: the hand-set one.
       sampler: of the planner.
     """
-    mine = [_training_scenes(one, features) for one in recorded]
+    mine = [_training_scenes(one, features, sampler) for one in recorded]
     pairs = zip(mine, shares, strict=True)
     weights = np.concatenate([np.full(len(x), share / len(x)) for x, share in pairs])
-    others = [_training_scenes(one, features, config.slowed) for one in elsewhere]
+    others = [
+        _training_scenes(one, features, sampler, config.slowed) for one in elsewhere
+    ]
     made = fit_familiarity(
         np.concatenate(mine),
         weights,
@@ -129,7 +131,7 @@ def unit_of(
     """
 
     def one(item: tuple[Scene, jax.Array]) -> jax.Array:
-        scene = with_predicted_futures(item[0])
+        scene = with_predicted_futures(as_planned(item[0], sampler))
         scene = scene.replace(time_valid=jnp.ones_like(scene.time_valid))
         candidates = sample(candidates_key(item[1]), scene, sampler)
         costs = -score(None, scene, candidates)
@@ -164,32 +166,39 @@ def read_prior_cost(path: Path) -> PriorCost:
 
 
 def _training_scenes(
-    dataset: Dataset, features: FeatureMap, slowed: Sequence[float] = ()
+    dataset: Dataset,
+    features: FeatureMap,
+    sampler: SamplerConfig,
+    slowed: Sequence[float] = (),
 ) -> np.ndarray:
     """Features of the training scenes, then of the same with a slower, steady ego."""
     scene = dataset.load("train").scene
     egos = [scene.ego.replace(v=x * scene.ego.v, a=0.0 * scene.ego.a) for x in slowed]
     scenes = [scene, *[scene.replace(ego=ego) for ego in egos]]
-    return np.concatenate([scene_features(one, features) for one in scenes])
+    return np.concatenate([scene_features(one, features, sampler) for one in scenes])
 
 
-def scene_features(scenes: Scene, features: FeatureMap) -> np.ndarray:
-    """[n, F] raw features of n scenes at t = 0, as the planner sees them."""
+def scene_features(
+    scenes: Scene, features: FeatureMap, sampler: SamplerConfig = ONLINE
+) -> np.ndarray:
+    """[n, F] raw features of n scenes at t = 0, as a planner of a sampler sees them."""
     count = len(scenes.ego.v)
     parts = []
     for first in range(0, count, LANES):
         # the last are filled up: one shape to compile
         at = np.minimum(np.arange(first, first + LANES), count - 1)
         some = jax.tree.map(lambda x, at=at: np.asarray(x)[at], scenes)
-        parts.append(np.asarray(_scene_features(some, features)))
+        parts.append(np.asarray(_scene_features(some, features, sampler)))
     return np.concatenate(parts)[:count]
 
 
-@functools.partial(jax.jit, static_argnames="features")
-def _scene_features(scenes: Scene, features: FeatureMap) -> jax.Array:
+@functools.partial(jax.jit, static_argnames=("features", "sampler"))
+def _scene_features(
+    scenes: Scene, features: FeatureMap, sampler: SamplerConfig
+) -> jax.Array:
     def one(scene: Scene) -> jax.Array:
-        scene = with_predicted_futures(scene)
-        straight = trajectory_on_path(scene, scene.ego.v * jnp.asarray(TIMES_S))
+        scene = with_predicted_futures(as_planned(scene, sampler))
+        straight = constant_speed_trajectory(scene, sampler.mode == "speed")
         rows = features.rows(scene, as_candidates(straight))
         return jnp.stack([row[0, 0] for row in rows])
 
@@ -276,14 +285,14 @@ def fit_prior_cost(
         "drives": [one.hash for one in drives],
         "features": config.train.features,
         "own_cost": run.own_cost.sha256 if run.own_cost else OWN_COST,
-        "sampler": config.train.sampler.own_sha256,
+        **run.candidates,
     }
-    online = config.train.sampler.on_own(ONLINE)
+    sampler = online(config.train.sampler).sampler
 
     def work() -> None:
         features = feature_map(config.train.features)
         made = fitted_prior_cost(
-            config.prior_cost, sources, shares, drives, features, run.own_cost, online
+            config.prior_cost, sources, shares, drives, features, run.own_cost, sampler
         )
         write_prior_cost(path, made)
 
@@ -313,12 +322,12 @@ def on_own_cost(run: Run, sources: Sequence[Dataset]) -> Run:
     inputs = {
         "own_cost": run.own_cost.sha256 if run.own_cost else OWN_COST,
         "recorded": [one.hash for one in sources],
-        "sampler": train.sampler.own_sha256,
+        **run.candidates,
     }
-    online = train.sampler.on_own(ONLINE)
+    sampler = online(train.sampler).sampler
 
     def work() -> None:
-        unit = float(unit_of(*some_scenes(sources), own_score(place), online))
+        unit = float(unit_of(*some_scenes(sources), own_score(place), sampler))
         write_json(path, {"own_cost": place, "unit": unit})
 
     run.stage("own unit", inputs, [path], work)

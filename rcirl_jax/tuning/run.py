@@ -42,7 +42,7 @@ from rcirl_jax.planner.own_cost import OwnCost, is_place
 from rcirl_jax.planner.program import is_program, program
 from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.runtime.pipeline import Stages, code_sha256, file_sha256
-from rcirl_jax.simulation.rows import BASELINES
+from rcirl_jax.simulation.rows import KNOWN_BASELINES
 from rcirl_jax.train.loop import Running
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.tuning.recipes import PriorCostConfig, SimulatedDemonstrations
@@ -98,11 +98,6 @@ class TuneConfig:
             raise InputError(f"drives: {self.drives}: expected at least 1")
         if self.seeds < 1:
             raise InputError(f"seeds: {self.seeds}: expected at least 1")
-        if self.train.sampler.mode != "speed":
-            raise InputError(
-                f"mode: {self.train.sampler.mode}: expected speed: demonstrations are "
-                "driven along given paths; `rcirl train` learns paths"
-            )
         self.train.reward.check_own()
 
 
@@ -174,6 +169,17 @@ class Run:
         return self.folder / "tuned_idm.json"
 
     @property
+    def steers(self) -> bool:
+        """True if paths are planned, not speed alone."""
+        return self.config.train.sampler.mode == "path_speed"
+
+    @property
+    def candidates(self) -> dict[str, str]:
+        """The part of a stage's inputs that says which candidates there are."""
+        sampler = self.config.train.sampler
+        return {"mode": sampler.mode, "sampler": sampler.own_sha256}
+
+    @property
     def seed_files(self) -> list[Path]:
         """The weights of every seed."""
         numbers = range(self.config.seeds)
@@ -217,7 +223,7 @@ class Run:
     def incumbent_reward(self) -> Reward | None:
         """The incumbent's reward; None: a baseline, an own cost or a program."""
         name = self.config.incumbent
-        other = name in BASELINES or is_place(name) or is_program(name)
+        other = name in KNOWN_BASELINES or is_place(name) or is_program(name)
         return None if other else open_reward(name)
 
     @property
@@ -233,4 +239,4 @@ class Run:
             return self.own_cost.sha256
         if is_program(name):
             return program(name).sha256
-        return name if name in BASELINES else file_sha256(Path(name))
+        return name if name in KNOWN_BASELINES else file_sha256(Path(name))

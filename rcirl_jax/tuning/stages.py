@@ -49,6 +49,7 @@ from rcirl_jax.export.sweep import SWEEP, read_sweep
 from rcirl_jax.export.weights import save_with_dial
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW
+from rcirl_jax.planner.mobil import MOBIL_ROW
 from rcirl_jax.report.replays import Replay, make_replays
 from rcirl_jax.runtime.atomic_files import read_json, write_json, write_whole
 from rcirl_jax.runtime.pipeline import digest, file_sha256
@@ -203,7 +204,7 @@ def rank(run: Run, dataset: Demonstrations) -> None:
         "dataset": dataset.hash,
         "evaluations": evaluations,
         "search": search,
-        "sampler": config.train.sampler.own_sha256,
+        **run.candidates,
     }
 
     def work() -> None:
@@ -305,7 +306,7 @@ def suite_job(run: Run, *, tuned: bool = True) -> tuple[SuiteJob, str]:
         duration_s=config.duration_s,
         catalogue_seed=config.catalogue_seed,
         plan_every=config.plan_every,
-        baselines=BASELINES,
+        baselines=(*BASELINES, *([MOBIL_ROW] if run.steers else [])),
         tuned_idm=read_tuned_idm(run.tuned_idm) if tuned else None,
         beside={TERMS_ROW: str(run.searched)} if tuned and searched else None,
     )
@@ -609,7 +610,12 @@ def report(
                 likeness=(run.folder / "likeness.txt").read_text(),
                 training_runs=config.seeds,
                 warnings=warnings_of(run),
-                facts={"recipe": config.recipe, **run.facts, "stages": shown},
+                facts={
+                    "recipe": config.recipe,
+                    "mode": config.train.sampler.mode,
+                    **run.facts,
+                    "stages": shown,
+                },
             ),
         )
 

@@ -39,7 +39,6 @@ WRONG = (
     (f"{TRAIN} --epochs=0", "--epochs: 0: expected >= 1"),
     (f"{TRAIN} --hidden_size=4 --constraint=nonnegative", "--hidden_size: (4,): exp"),
     (f"{TUNE} --synthetic --suite=all", "--suite: all: expected full"),
-    (f"{TUNE} --synthetic --mode=path_speed", "path_speed: expected speed"),
     (f"{TUNE} --synthetic --cases=1", "--cases: 23 in all: the gate expects at least"),
     (f"{TUNE} --synthetic --sweep=nowhere", "nowhere/sweep.json: No such file"),
     (f"{GATE} --incumbent=nobody", "nobody"),

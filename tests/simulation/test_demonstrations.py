@@ -6,6 +6,7 @@ import pytest
 
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
+from rcirl_jax.simulation.rows import mobil_row
 from rcirl_jax.simulation.suite import CaseRef
 from rcirl_jax.units import TIMES_S
 from tests.simulation.drives import constant
@@ -44,3 +45,17 @@ def test_only_the_drivers_turns_are_kept(tmp_path):
     assert first.min() < 1.0  # it stands where the learner left it
     way = np.asarray(rows.human.s)[:, -1]
     assert (way > 5.0).all()  # and the driver drives off
+
+
+def test_offsets_of_a_driver_that_changes_lanes_are_from_its_lane(tmp_path):
+    """Wherever a scene begins, the human is at its ego's offset, within its lane."""
+    refs = [CaseRef(family="cut_out", index=i, seed=7) for i in range(2)]
+    row = mobil_row()
+    drive_catalogue(refs, tmp_path, CONFIG, expert=(row.policy, row.params))
+    rows = open_dataset(str(tmp_path)).load(None)
+    l = np.asarray(rows.human.l)
+    np.testing.assert_allclose(l[:, 0], rows.scene.ego.l, atol=1e-3)
+    assert np.abs(l[:, 0]).max() < 2.0
+    changes = np.abs(l[:, -1]) > 3.0
+    assert 0 < changes.sum() < len(changes)
+    np.testing.assert_array_equal(rows.scene.path.l, 0.0)

@@ -2,6 +2,7 @@
 
 import pytest
 
+from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.tuning import demonstrations
 from rcirl_jax.tuning.recipes import SimulatedDemonstrations
@@ -45,3 +46,12 @@ def test_a_learner_that_only_shows_where_it_gets_to_drives_alone(
     assert (asked["expert"][1].own == hand_set[1].own) != alone
     assert asked["stride_s"] == (plan.stride_s if alone else plan.takeover_stride_s)
     assert asked["seeds"] == {71}
+
+
+@pytest.mark.parametrize("expert", ["driver model", "own cost"])
+def test_where_paths_are_planned_the_expert_plans_them(expert):
+    plan = SimulatedDemonstrations(expert=expert)
+    config = TrainConfig(sampler=SamplerConfig(mode="path_speed"))
+    found = demonstrations.expert_of(plan, "hand-set", config)
+    assert found is not None
+    assert vars(found[0])["steers"]

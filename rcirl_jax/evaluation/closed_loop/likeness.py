@@ -37,6 +37,7 @@ from rcirl_jax.evaluation.statistics import (
     combine_seeds,
     paired_difference,
 )
+from rcirl_jax.planner.mobil import MOBIL_ROW
 from rcirl_jax.planner.program import name_cases
 from rcirl_jax.runtime.executors import two_at_a_time
 from rcirl_jax.simulation.cases import STEP_S, Record
@@ -66,7 +67,7 @@ BRAKING_MPS2 = 4.0  # m/s^2, hard braking of others
 HEADWAY_S = 1.0  # s, short headway
 MOVING_MPS = 1.0  # m/s below which a headway says nothing
 CHUNK = 10 * LANES  # drives in memory at a time
-REFERENCES = ("hand-set", "IDM", "IDM, tuned", "+velocity", "constant V")
+REFERENCES = ("hand-set", "IDM", "IDM, tuned", MOBIL_ROW, "+velocity", "constant V")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

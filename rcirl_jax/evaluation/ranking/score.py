@@ -37,7 +37,7 @@ from rcirl_jax.reward import (
 from rcirl_jax.runtime.compiling import CompilesFirst
 from rcirl_jax.runtime.executors import Executor, Serial
 from rcirl_jax.sampling import SamplerConfig, sample
-from rcirl_jax.sampling.sampler import as_candidates
+from rcirl_jax.sampling.sampler import as_candidates, as_planned
 from rcirl_jax.train.featurise import human_of
 from rcirl_jax.types import Candidates, Demonstration, Scene, Trajectory
 from rcirl_jax.units import DT_S, NUM_TIMES, TIMES_S
@@ -208,7 +208,7 @@ def measure_scenes(
 @functools.cache
 def _measure_batch(sampler: SamplerConfig, horizon_s: float, futures: str) -> Callable:
     def one(index: jax.Array, demonstration: Demonstration) -> Measured:
-        scene = demonstration.scene
+        scene = as_planned(demonstration.scene, sampler)
         scene = with_predicted_futures(scene) if futures == "predicted" else scene
         made, fde, ade = measured(index, demonstration, scene, sampler, horizon_s)
         return Measured(made.feasible, fde, ade)
@@ -291,7 +291,7 @@ def _score_batch(
         index: jax.Array,
         demonstration: Demonstration,
     ) -> dict:
-        recorded = demonstration.scene
+        recorded = as_planned(demonstration.scene, sampler)
         scene = select_future(recorded, predicted)
         mask, human = horizon_mask(scene, horizon_s), human_of(demonstration, sampler)
         cut = scene.replace(time_valid=mask)
