@@ -9,6 +9,7 @@ import numpy as np
 from rcirl_jax.data.store.dataset import Demonstrations
 from rcirl_jax.data.store.rows import check_some
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.ranking.lanes import LaneOutcomes, lane_metrics
 from rcirl_jax.evaluation.ranking.metrics import (
     fit_temperature,
     oracle_scorer,
@@ -91,7 +92,10 @@ def rank_scenes(
     ) -> dict[str, np.ndarray]:
         if name not in temperatures:
             temperatures[name] = fit_temperature(on_training, trained.outcomes)
-        return scene_metrics(values, human, scored.outcomes, temperatures[name])
+        found = scene_metrics(values, human, scored.outcomes, temperatures[name])
+        if scored.lanes:
+            found |= lane_metrics(values, scored.outcomes.feasible, scored.lanes)
+        return found
 
     def of(name: str) -> dict[str, np.ndarray]:
         values = trained.values[name], scored.values[name], scored.human_values[name]
@@ -116,7 +120,9 @@ def rank_scenes(
         "oracle": [metrics("oracle", *best)],
     }
     group = np.asarray(rows.group)
-    return Ranked(table=table, outcomes=scored.outcomes, group=group)
+    return Ranked(
+        table=table, outcomes=scored.outcomes, group=group, lanes=scored.lanes
+    )
 
 
 def pooled(parts: Sequence[Ranked]) -> Ranked:
@@ -142,10 +148,17 @@ def pooled(parts: Sequence[Ranked]) -> Ranked:
         row: jax.tree.map(join, *(list(part.table[row]) for part in parts))
         for row in parts[0].table
     }
+    lanes = [part.lanes for part in parts if part.lanes]
     return Ranked(
         table=table,
         outcomes=dataclasses.replace(first, **several),
         group=join(*(np.asarray(part.group) for part in parts)),
+        lanes=LaneOutcomes(
+            *(jax.tree.map(join, *(x[i] for x in lanes)) for i in range(2)),
+            first.horizon_s,
+        )
+        if lanes
+        else None,
     )
 
 

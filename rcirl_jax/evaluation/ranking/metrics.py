@@ -21,6 +21,7 @@ import numpy as np
 from scipy.optimize import root_scalar
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.statistics import CONFIDENCE, Estimate, clopper_pearson
 
 FAILURE_M = 10.0  # m, least FDE charged for a failure; above every miss limit
 TOP_COUNT = 3  # candidates among which top-3 looks (Driving-IRL-NGSIM)
@@ -131,19 +132,19 @@ def scene_metrics(
     count = np.sum(feasible, axis=1)
     some = count > 0
     order = np.argsort(-values, axis=1, kind="stable")  # infeasible ones last
-    chosen, nearest = np.where(some, order[:, 0], 0), _nearest(outcomes)
+    chosen, nearest = chosen_of(values, feasible), _nearest(outcomes)
     crash = (
         np.asarray(outcomes.crash, bool) & ~np.asarray(outcomes.human_crash)[:, None]
     )
     fde = np.asarray(outcomes.fde, np.float64)
     failed = crash | ~some[:, None]
     charged = np.where(failed, np.maximum(fde, outcomes.failure_m), fde)
-    top1_fde, chosen_crash = _pick(fde, chosen), _pick(crash, chosen)
+    top1_fde, chosen_crash = pick(fde, chosen), pick(crash, chosen)
     miss = (top1_fde > miss_threshold(outcomes.horizon_s)) | ~some
     below = np.sum(feasible & (values < human_value[:, None]), axis=1)
     equal = np.sum(feasible & (values == human_value[:, None]), axis=1)
     share = (below + 0.5 * equal) / np.maximum(count, 1)
-    own = _pick(values, nearest)[:, None]
+    own = pick(values, nearest)[:, None]
     rank = np.sum(values > own, axis=1) + 0.5 * (np.sum(values == own, axis=1) + 1.0)
     top = order[:, :TOP_COUNT]
     # differences first: a large common offset must not cost digits
@@ -155,12 +156,12 @@ def scene_metrics(
         "num_pairs": np.maximum(count, 1),
         "human_top1": (below == count) & (count > 0),
         "top1_fde": top1_fde,
-        "top1_fde_failure": _pick(charged, chosen),
-        "top1_ade": _pick(outcomes.ade, chosen),
+        "top1_fde_failure": pick(charged, chosen),
+        "top1_ade": pick(outcomes.ade, chosen),
         "top3_fde": _best_of(fde, top, feasible),
         "top3_fde_failure": _best_of(charged, top, feasible),
         "mrr": np.where(some, 1.0 / rank, 0.0),
-        "nll": np.log(np.exp(shifted).sum(axis=1)) - _pick(shifted, nearest),
+        "nll": np.log(np.exp(shifted).sum(axis=1)) - pick(shifted, nearest),
         "crash_rate": chosen_crash,
         "failure_rate": chosen_crash | ~some,
         "miss": miss,
@@ -234,7 +235,7 @@ def fit_temperature(values: np.ndarray, outcomes: Outcomes) -> float:
         return 1.0
     spread = largest * np.sqrt(np.sum((centred / largest) ** 2) / feasible.sum())
     scaled = centred / spread
-    target = _pick(scaled, _nearest(outcomes)[some])
+    target = pick(scaled, _nearest(outcomes)[some])
 
     def slope(log_b: float) -> float:
         """NLL'(b), times the scenes."""
@@ -276,9 +277,45 @@ def _checked(
     return values, human_value
 
 
-def _pick(array: np.ndarray, index: np.ndarray) -> np.ndarray:
+def chosen_of(values: np.ndarray, feasible: np.ndarray) -> np.ndarray:
+    """Returns [S], the feasible candidate of highest value; 0 where there is none.
+
+    Args:
+      values: [S, K], of all candidates.
+      feasible: [S, K] bool.
+    """
+    return np.argmax(np.where(feasible, values, -np.inf), axis=1)
+
+
+def pick(array: np.ndarray, index: np.ndarray) -> np.ndarray:
     """Returns [S], the entry of each row at its index."""
     return np.take_along_axis(array, index[:, None], axis=1)[:, 0]
+
+
+def bounded(found: Estimate, values: np.ndarray, unit: str, vehicles: int) -> Estimate:
+    """Returns the estimate of a share with an interval within 0 and 1.
+
+    A share that is 0 or 1 in every scene has no bootstrap spread. Its interval is
+    then the exact one-sided bound for vehicles, about 3 / vehicles: where a share q
+    of vehicles ever shows the event, at most about q of the scenes do.
+
+    Args:
+      found: with its bootstrap interval.
+      values: [R, S].
+      unit: only shares, "%", are changed.
+      vehicles: number of clusters.
+    """
+    if unit != "%":
+        return found
+    # the other end is certain, so all of the error probability goes to this one
+    two_sided = 2.0 * CONFIDENCE - 1.0
+    for end in (0.0, 1.0):
+        if np.all(values == end):
+            low, high = clopper_pearson(int(end) * vehicles, vehicles, two_sided)
+            return dataclasses.replace(found, value=end, low=low, high=high, exact=True)
+    # stretched run weights can push an end of a share over 0 or 1
+    low, high = max(found.low, 0.0), min(found.high, 1.0)
+    return dataclasses.replace(found, low=low, high=high)
 
 
 def _nearest(outcomes: Outcomes) -> np.ndarray:

@@ -17,9 +17,17 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.summary import text_table
+from rcirl_jax.evaluation.ranking.lanes import (
+    IN_TIME_S,
+    LANE_METRICS,
+    LaneOutcomes,
+    LaneReport,
+    lane_report,
+)
 from rcirl_jax.evaluation.ranking.metrics import (
     METRICS,
     Outcomes,
+    bounded,
     miss_threshold,
     oracle_fde,
 )
@@ -30,13 +38,13 @@ from rcirl_jax.evaluation.statistics import (
     Difference,
     Estimate,
     bootstrap_median,
-    clopper_pearson,
     combine_seeds,
     difference_of,
     estimate_of,
     holm,
 )
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW
+from rcirl_jax.planner.mobil import MOBIL_ROW
 from rcirl_jax.reward import LONG_ROW, SPEED_DP_ROW, TUNED_ROW
 from rcirl_jax.runtime.checked import checked
 
@@ -47,7 +55,7 @@ UNTRAINED_ROW = "random weights"  # networks as they are before the first step
 
 # Rows that are not learned, in the order printed below the learned ones.
 BASELINE_ROWS = (
-    *("random", UNTRAINED_ROW, "constant speed", "IDM", TUNED_IDM_ROW),
+    *("random", UNTRAINED_ROW, "constant speed", "IDM", TUNED_IDM_ROW, MOBIL_ROW),
     *(SPEED_DP_ROW, "hand-set", TUNED_ROW, LONG_ROW, "oracle"),
 )
 # rows that the others are compared with
@@ -94,6 +102,8 @@ class RankingReport:
     confidence: float
     num_resamples: int
     warnings: tuple[str, ...] = ()  # of `ranking_warnings`
+    # the choice of lane; None along given paths, or where too few change lanes
+    lanes: LaneReport | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -104,6 +114,7 @@ class Ranked:
     table: Mapping[str, Sequence[Mapping[str, np.ndarray]]]
     outcomes: Outcomes
     group: np.ndarray | None = None  # [S] int, vehicle-disjoint group, to be counted
+    lanes: LaneOutcomes | None = None  # where paths are planned
 
 
 def build_report(
@@ -185,7 +196,7 @@ def build_report(
         runs={name: len(runs) for name, runs in scorers.items()},
         rows={
             name: {
-                metric: _bounded(
+                metric: bounded(
                     estimate_of(*resampled(name, metric, 1)),
                     values[metric],
                     METRICS[metric].unit,
@@ -206,6 +217,7 @@ def build_report(
         oracle_floor_median=bootstrap_median(floor, bootstrap),
         confidence=CONFIDENCE,
         num_resamples=num_resamples,
+        lanes=ranked.lanes and lane_report(scorers, ranked.lanes, outcomes.cluster),
     )
 
 
@@ -255,32 +267,6 @@ def not_ahead(row: str, apart: Mapping[str, Difference]) -> str:
 def is_baseline(row: str) -> bool:
     """Returns whether a row is not learned."""
     return row in BASELINE_ROWS
-
-
-def _bounded(found: Estimate, values: np.ndarray, unit: str, vehicles: int) -> Estimate:
-    """Returns the estimate of a share with an interval within 0 and 1.
-
-    A share that is 0 or 1 in every scene has no bootstrap spread. Its interval is
-    then the exact one-sided bound for vehicles, about 3 / vehicles: where a share q
-    of vehicles ever shows the event, at most about q of the scenes do.
-
-    Args:
-      found: with its bootstrap interval.
-      values: [R, S].
-      unit: only shares, "%", are changed.
-      vehicles: number of clusters.
-    """
-    if unit != "%":
-        return found
-    # the other end is certain, so all of the error probability goes to this one
-    two_sided = 2.0 * CONFIDENCE - 1.0
-    for end in (0.0, 1.0):
-        if np.all(values == end):
-            low, high = clopper_pearson(int(end) * vehicles, vehicles, two_sided)
-            return dataclasses.replace(found, value=end, low=low, high=high, exact=True)
-    # stretched run weights can push an end of a share over 0 or 1
-    low, high = max(found.low, 0.0), min(found.high, 1.0)
-    return dataclasses.replace(found, low=low, high=high)
 
 
 def verdict(difference: Difference, p_holm: float, higher_is_better: bool) -> str:
@@ -376,8 +362,33 @@ def format_table(
             block = [0]
         block.append(column)
     lines += ["", *_columns(grid, block)]
+    lines += _lanes(report.lanes, names, width) if report.lanes else []
     lines += _differences(report, learned or names) if differences else []
     return "\n".join(lines) + "\n"
+
+
+def _lanes(found: LaneReport, names: Sequence[str], width: int) -> list[str]:
+    """Formats the choice of lane as lines."""
+    said = (
+        f"Choice of lane: {found.changes:,} scenes of {found.vehicles:,} vehicles in "
+        "which the human crosses a line and ends beyond it; the last column is of the "
+        f"{found.stays:,} in which it crosses none. Who never crosses, or ends on "
+        "another side, crosses at the horizon. IDM and constant speed keep their lane."
+    )
+    head = ["", *(how.title for how in LANE_METRICS.values())]
+    rows = [
+        [
+            name,
+            *(_cell(found.rows[name][x], how.unit) for x, how in LANE_METRICS.items()),
+        ]
+        for name in names
+    ]
+    head.append(f"within {IN_TIME_S:g} s minus MOBIL")
+    for row in rows:
+        d = found.minus_mobil.get(row[0])
+        ends = d and [f"{100.0 * x:+.1f}" for x in (d.mean, d.low, d.high)]
+        row.append("{} [{}, {}]".format(*ends) if ends else "")
+    return ["", *textwrap.wrap(said, width), *text_table(head, rows)]
 
 
 def _columns(grid: Sequence[Sequence[str]], which: Sequence[int]) -> list[str]:

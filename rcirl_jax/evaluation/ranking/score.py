@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.data.store.rows import refuse_scenes
+from rcirl_jax.evaluation.ranking.lanes import LaneOutcomes, lanes_of
 from rcirl_jax.evaluation.ranking.metrics import Outcomes
 from rcirl_jax.features import feature_map
 from rcirl_jax.features.columns import COLUMNS
@@ -25,6 +26,7 @@ from rcirl_jax.planner.baselines import (
     constant_speed_trajectory,
     idm_trajectory,
 )
+from rcirl_jax.planner.mobil import MOBIL_ROW, Mobil, mobil_trajectory
 from rcirl_jax.planner.own_cost import OwnCost
 from rcirl_jax.planner.prediction import select_future, with_predicted_futures
 from rcirl_jax.reward import (
@@ -98,7 +100,8 @@ class RankingSetup:
     @property
     def baselines(self) -> tuple[str, ...]:
         """Names of the baselines without parameters."""
-        return (*BASELINES, *([self.own.name] if self.own else []))
+        mobil = [] if self.sampler.mode == "speed" else [MOBIL_ROW]
+        return (*BASELINES, *mobil, *([self.own.name] if self.own else []))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -108,6 +111,7 @@ class Scored:
     outcomes: Outcomes
     values: dict[str, np.ndarray]  # scorer -> [S, K], higher is better
     human_values: dict[str, np.ndarray]  # scorer -> [S]
+    lanes: LaneOutcomes | None = None  # where paths are planned
 
 
 class Measured(NamedTuple):
@@ -260,12 +264,17 @@ def score_scenes(
             bar.update(len(part["fde"]))
     made = jax.tree.map(lambda *x: np.concatenate(x), *parts)
     values, human_values = made.pop("values"), made.pop("human_values")
+    lanes = None
+    if ways := made.pop("lanes", None):
+        lanes = LaneOutcomes(*ways, setup.horizon_s)
     if setup.drop_collisions:
         made["feasible"] = made["feasible"] & ~made["crash"]
     outcomes = Outcomes(
         **made, cluster=np.asarray(rows.vehicle), horizon_s=setup.horizon_s
     )
-    return Scored(outcomes=outcomes, values=values, human_values=human_values)
+    return Scored(
+        outcomes=outcomes, values=values, human_values=human_values, lanes=lanes
+    )
 
 
 @functools.cache
@@ -321,6 +330,13 @@ def _score_batch(
         }
         if own is not None:
             values[own.name] = own.score(None, cut, both)
+        lanes = {}
+        if not on_path:
+            values[MOBIL_ROW] = near_to(mobil_trajectory(scene, Mobil()))
+            ends = jax.vmap(lambda x: position_at(x, horizon_s)[1])(ways)
+            made = lanes_of(ways.l, ends, scene.path, horizon_s)
+            parts = [jax.tree.map(lambda x, i=i: x[i], made) for i in (np.s_[:-1], -1)]
+            lanes = {"lanes": tuple(parts)}
         hit = COLUMNS["collision"](candidate_frames(recorded, ways))  # [T, K + 1]
         crash = jnp.any((hit > 0.0) & mask[:, None], axis=0)
         made = features.of_candidates(scene, both)
@@ -333,6 +349,7 @@ def _score_batch(
             "crash": crash[:-1],
             "human_crash": crash[-1],
             "time_valid": mask,
+            **lanes,
             "values": {name: x[:-1] for name, x in values.items()},
             "human_values": {name: x[-1] for name, x in values.items()},
         }
