@@ -10,8 +10,9 @@ It is the same for learned, hand-set and random scores. For each candidate:
 4. a distance from which braking still avoids the leader (RSS, Shalev-Shwartz
    et al. 2017), or at least a growing margin where another car took it away;
 5. where paths are planned, the same distance to whom the ego moves in behind, and one
-   from which whoever it moves in ahead of can brake gently; before what never moves,
-   room to get round it.
+   from which whoever it moves in ahead of can brake gently, as a human would: what is
+   predicted of it afterwards, as if it had not seen the ego, touches nothing; before
+   what never moves, room to get round it.
 
 `check` tells which candidates keep all rules, `explain` which rule each breaks first.
 Numbers of an obstacle at times when it is not there are never read.
@@ -262,7 +263,7 @@ def last_resort(
     x = motion_of(candidates.trajectory)
     xp = namespace(x.s, scene.path.l)
     bare = dataclasses.replace(
-        config, margin_along=0.0, margin_growth=0.0, margin_across=0.05
+        config, margin_along=0.0, margin_growth=0.0, margin_across=0.05, entry=False
     )
     body = first_contact(scene, x, bare)
     crossed = xp.any(_crossings(scene, x, config), axis=0)
@@ -318,7 +319,8 @@ def _touches(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
         |m_s h_l - m_l h_s| <= e_s |h_l| + e_l |h_s|
 
     Boxes that are tilted enter with their extents along the axes, which
-    contain them. A body that overlaps the ego's corridor from behind does not count.
+    contain them. A body that overlaps the ego's corridor from behind does not count,
+    nor does one that the ego has moved in ahead of, by rule 5.
     """
     obstacles, ego = scene.obstacles, scene.ego
     xp = namespace(x.s, obstacles.s_lower)
@@ -360,7 +362,14 @@ def _touches(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
         cross = xp.abs(m_s * (dl[1:] - dl[:-1]) - m_l * (ds[1:] - ds[:-1]))
         near = (xp.abs(m_s) <= e_s + h_s) & (xp.abs(m_l) <= e_l + h_l)
         near = near & (0.5 * cross <= e_s * h_l + e_l * h_s)
-        yield near & known[n] & ~behind[n]
+        near = near & known[n] & ~behind[n]
+        if config.entry and config.track == "full":
+            is_in, enters, ahead = _entries(scene, x, config, n)
+            drives = obstacles.kind[n] <= Kind.CYCLIST
+            follows = drives & xp.any(enters & ~ahead[1:], axis=0)
+            follows = follows & ~xp.any(enters & ahead[1:], axis=0)
+            near = near & ~(is_in[:-1] & follows)
+        yield near
 
 
 def _crossings(scene: Scene, x: Motion, config: SafetyConfig) -> Array:
@@ -395,11 +404,34 @@ def _rss_distance(v: Array, lead: Array, config: SafetyConfig) -> Array:
     return xp.maximum(needed, 0.0) + config.standstill
 
 
+def _entries(
+    scene: Scene, x: Motion, config: SafetyConfig, n: int
+) -> tuple[Array, Array, Array]:
+    """The ego in the corridor of obstacle n, where it did not have to be.
+
+    The ego enters where its box comes beside or before one that it would be clear of at
+    its offset of t = 0; whoever changes lane towards it is not its doing.
+
+    Returns:
+      Whether it is in [T, K], enters [T - 1, K], and has the obstacle ahead [T, K].
+    """
+    obstacles = scene.obstacles
+    xp = namespace(x.s, obstacles.s_lower)
+    reach = 0.5 * scene.ego.width + config.margin_across
+    body = (obstacles.kind[n] >= Kind.VEHICLE) & (obstacles.kind[n] <= Kind.STATIC)
+    low_s, high_s, low_l, high_l, valid = (
+        getattr(obstacles, name)[n][:, None]
+        for name in ("s_lower", "s_upper", "l_lower", "l_upper", "valid")
+    )
+    aside = lambda l: xp.maximum(low_l - l, l - high_l)  # noqa: E731
+    is_in = (aside(x.l) < reach) & (aside(x.l[:1]) >= reach) & valid & body
+    return is_in, is_in[1:] & ~is_in[:-1], 0.5 * (low_s + high_s) > x.s
+
+
 def _crowds(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
     """For each obstacle, when [T - 1, K] the ego enters its corridor too near to it.
 
-    The ego enters where its box comes beside or before one that it would be clear of at
-    its offset of t = 0; whoever changes lane towards it is not its doing. Then
+    Where it enters (`_entries`)
 
         ahead:   gap >= d of `_rss_distance`
         behind:  gap >= v_r rho_r + max(v_r^2 - v^2, 0) / (2 b_r) + standstill
@@ -411,15 +443,11 @@ def _crowds(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
     xp = namespace(x.s, obstacles.s_lower)
     reach = 0.5 * ego.width + config.margin_across
     for n in range(obstacles.kind.shape[0]):
-        body = (obstacles.kind[n] >= Kind.VEHICLE) & (obstacles.kind[n] <= Kind.STATIC)
         low_s, high_s, low_l, high_l, speed, valid = (
             getattr(obstacles, name)[n][:, None]
             for name in ("s_lower", "s_upper", "l_lower", "l_upper", "speed", "valid")
         )
-        aside = lambda l, low=low_l, high=high_l: xp.maximum(low - l, l - high)  # noqa: E731
-        is_in = (aside(x.l) < reach) & (aside(x.l[:1]) >= reach) & valid & body
-        enters = is_in[1:] & ~is_in[:-1]
-        ahead = 0.5 * (low_s + high_s) > x.s
+        _, enters, ahead = _entries(scene, x, config, n)
         before = low_s - x.s - 0.5 * ego.length
         after = x.s - 0.5 * ego.length - high_s
         brakes = xp.maximum(speed**2 - x.v**2, 0.0) / (2.0 * config.rear_braking)
@@ -430,9 +458,8 @@ def _crowds(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
             after < xp.where(speed > 0.0, behind, 0.0) + config.standstill,
         )
         crowds = enters & near[1:]
-        stuck = (
-            (obstacles.kind[n] == Kind.STATIC) & valid & (aside(x.l) < reach) & ahead
-        )
+        in_way = xp.maximum(low_l - x.l, x.l - high_l) < reach
+        stuck = (obstacles.kind[n] == Kind.STATIC) & valid & valid[:1] & in_way & ahead
         stuck = stuck & (before < config.room) & (before < before[:1] - NEARER_M)
         last = xp.arange(1, x.s.shape[0])[:, None] == x.s.shape[0] - 1
         yield crowds | (stuck[1:] & last)

@@ -262,8 +262,22 @@ def test_whoever_is_met_in_a_lane_that_is_entered_has_room(gap, speed, fine):
     told = explain(*jax.tree.map(np.asarray, (made, both)), SafetyConfig(entry=True))
     assert told.reason[0] == Reason.NONE
     assert (told.reason[1] == Reason.NONE) == fine
-    if not fine and speed == 20.0:
+    if not fine:
         assert (told.reason[1], told.obstacle[1]) == (Reason.ENTRY, 0)
+
+
+@pytest.mark.parametrize(("gap", "fine"), [(33.0, True), (24.0, False)])
+def test_whoever_has_room_to_brake_is_taken_to_brake(gap, fine):
+    """At 10 m/s it reaches the ego at 5 m/s, unless it brakes, for which 19.5 m do."""
+    s = -gap - 0.5 * (4.9 + 4.0)
+    made = with_obstacle(Kind.VEHICLE, s, 3.6, v=5.0, speed=10.0)
+    both = moving_left(made, 5.0)
+    there = np.asarray(judge(made, both).contact_s)
+    assert np.isinf(there[0])  # without rule 5 it drives on, into the ego
+    assert np.isfinite(there[1])
+    assert np.asarray(ENTRY(made, both).admissible).tolist() == [True, fine]
+    needs = last_resort(made, both, ENTRY(made, both), SafetyConfig(entry=True))
+    assert np.isfinite(needs.contact_s[1])  # nobody relies on it in need
 
 
 def test_one_who_changes_lane_towards_the_ego_is_not_entered():
