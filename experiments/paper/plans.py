@@ -20,9 +20,9 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.statistics import combine_seeds
 from rcirl_jax.features import FeatureMap
-from rcirl_jax.planner.dp import DpConfig, Weights, optimality_gap
+from rcirl_jax.planner.dp import DpConfig, optimality_gap
 from rcirl_jax.planner.plan import Plan, command
-from rcirl_jax.planner.rank import Policy
+from rcirl_jax.planner.rank import Params, Policy, Ranking
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.simulation.cases import STEP_S, Case
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
@@ -69,7 +69,7 @@ def disturbed(key: jax.Array, scene: Scene, config: Disturbance) -> Scene:
 
 @functools.lru_cache(maxsize=8)
 def _steadiness(policy: Policy, config: Disturbance) -> Callable:
-    def measure(params: Weights, scene: Scene, key: jax.Array) -> dict[str, jax.Array]:
+    def measure(params: Params, scene: Scene, key: jax.Array) -> dict[str, jax.Array]:
         draw, plan_key = jax.random.split(key)
         keys = jax.random.split(draw, config.samples)
         scenes = jax.vmap(lambda k: disturbed(k, scene, config))(keys)
@@ -83,7 +83,7 @@ def _steadiness(policy: Policy, config: Disturbance) -> Callable:
 
 
 def steadiness(
-    policy: Policy, params: Weights, scenes: Scene, config: Disturbance
+    policy: Policy, params: Params, scenes: Scene, config: Disturbance
 ) -> dict[str, np.ndarray]:
     """Spread [B] of the plan of each scene under disturbances.
 
@@ -106,7 +106,7 @@ def _one_by_one(measure: Callable, scenes: Scene) -> dict[str, np.ndarray]:
 
 def gaps(
     policies: Mapping[str, Policy],
-    params: Weights,
+    params: Ranking,
     scenes: Scene,
     case: np.ndarray,
     features: FeatureMap,
@@ -124,12 +124,13 @@ def gaps(
     key = jax.random.key(0)
 
     @jax.jit
-    def measure(params: Weights, scene: Scene) -> dict[str, jax.Array]:
+    def measure(params: Ranking, scene: Scene) -> dict[str, jax.Array]:
+        weights = (params.reward, params.normaliser)
         plans = [policy(params, scene, key).s for policy in policies.values()]
 
         def of_plan(s: jax.Array) -> dict[str, jax.Array]:
             plan = trajectory_on_path(scene, s)
-            return optimality_gap(scene, plan, params, features, activation, lattice)
+            return optimality_gap(scene, plan, weights, features, activation, lattice)
 
         return jax.vmap(of_plan)(jnp.stack(plans))
 
@@ -152,7 +153,7 @@ def gaps(
 
 def frames(
     policy: Policy,
-    params: Weights,
+    params: Params,
     cases: Case,
     duration_s: float,
     every_s: float,

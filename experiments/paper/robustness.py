@@ -34,8 +34,9 @@ from rcirl_jax.planner.rank import (
     Policy,
     RankConfig,
     hand_score,
-    learned_score,
     rank_policy,
+    ranking,
+    ranking_policy,
 )
 from rcirl_jax.report.charts import interval_chart
 from rcirl_jax.runtime.atomic_files import write_json
@@ -84,11 +85,11 @@ def main() -> None:
     if reward.prior_cost is not None:
         raise InputError(
             f"--weights: {reward.file}: expected a reward without a prior cost: the "
-            "lattice of the DP has no own cost"
+            "gap is one of V alone"
         )
-    params, config = reward_params(reward), RankConfig()
+    params, config = ranking(reward_params(reward)), RankConfig()
     features, activation = feature_map(str(reward.preset)), reward.activation
-    rank = rank_policy(learned_score(features, activation), config)
+    rank = ranking_policy(features, activation, config)
     coarse = DpConfig(step=4.0 if quick else 2.0)
     few, duration = ("free_cruise,stopped_lead", 20.0) if quick else ("full", 60.0)
     cases = build(suite_refs(few, 1, CATALOGUE_SEED), duration)

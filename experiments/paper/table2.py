@@ -6,9 +6,10 @@
 Without --weights rewards are trained as by `experiments.paper.rank_against_gan`, whose
 flags of training these are: every loss alone and on top of the own cost. Two seeds
 train, the first drives. OUTPUT/suite holds the table of every row, OUTPUT/dp that of
-the first file without a prior cost by ranking and by dynamic programming on --dp_cases
-of each family. Expected: four hours of two cores, nearly all of it the suite, a quarter
-of an hour a row. `--quick`: three minutes, numbers without meaning.
+the first file by ranking, by search beside the sampled candidates and by the plans of
+search alone, on --dp_cases of each family. Expected: four hours of two cores, nearly
+all of it the suite, a quarter of an hour a row. `--quick`: three minutes, numbers
+without meaning.
 """
 
 import dataclasses
@@ -32,7 +33,6 @@ from experiments.paper.step_sizes import with_chosen_rates
 from rcirl_jax.cli.running import run
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite, write_suite
 from rcirl_jax.export.closed_loop import table_rows
-from rcirl_jax.export.loading import open_reward
 from rcirl_jax.report.charts import suite_chart
 from rcirl_jax.simulation.rows import BASELINES, Row
 from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
@@ -89,11 +89,9 @@ def main() -> None:
     rows = table_rows(files, BASELINES, names=names)
     made_by = as_used(files)
     table("suite", rows, "full", None, made_by)
-    alone = [file for file in files if open_reward(file).prior_cost is None]
-    if alone:
-        rows = table_rows(alone[:1], ("hand-set", "IDM"), dp=True)
-        which = "free_cruise,stopped_lead" if QUICK.value else "full"
-        table("dp", rows, which, _DP_CASES.value, made_by)
+    rows = table_rows(files[:1], ("hand-set", "IDM"), dp=True)
+    which = "free_cruise,stopped_lead" if QUICK.value else "full"
+    table("dp", rows, which, _DP_CASES.value, made_by)
 
 
 if __name__ == "__main__":

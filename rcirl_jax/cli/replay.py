@@ -2,9 +2,9 @@
 
     rcirl replay --weights=FILE --case=cut_in/017@0 --output=DIR
 
-`--row` names who drives: learned (default), dp, or a baseline. Writes DIR/case.html,
-which begins at the worst moment of the drive; what made it is in it. Needs the extra
-[report].
+`--row` names who drives: learned (default), search, dp, or a baseline. Writes
+DIR/case.html, which begins at the worst moment of the drive; what made it is in it.
+Needs the extra [report].
 """
 
 from pathlib import Path
@@ -30,7 +30,7 @@ _CASE = flags.DEFINE_string(
     "case", None, "id in a report or cases.csv, as cut_in/017@0", required=True
 )
 _ROW = flags.DEFINE_enum(
-    "row", "learned", ["learned", "dp", *KNOWN_BASELINES], "who drives"
+    "row", "learned", ["learned", "search", "dp", *KNOWN_BASELINES], "who drives"
 )
 _DURATION = flags.DEFINE_float("duration", FULL_S, "s of the drive, 1 to 120")
 _EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans", 1)
@@ -39,9 +39,10 @@ _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
 
 def _row() -> Row:
     names = [_ROW.value] if _ROW.value in KNOWN_BASELINES else []
-    wants_dp = _ROW.value == "dp"
-    rows = table_rows([_WEIGHTS.value], names, _EVERY.value, dp=wants_dp)
-    return rows[0] if _ROW.value == "learned" else rows[1]
+    searches = _ROW.value in ("search", "dp")
+    rows = table_rows([_WEIGHTS.value], names, dp=searches)
+    at = {"learned": 0, "dp": 2}
+    return rows[at.get(_ROW.value, 1)]
 
 
 def main() -> None:

@@ -74,7 +74,10 @@ _IDM = flags.DEFINE_string(
     "tuned_idm", None, "RUN/tuned_idm.json of autotune: a tuned IDM drives too"
 )
 _DP = flags.DEFINE_bool(
-    "dp", False, "the first weights also drive by dynamic programming"
+    "dp",
+    False,
+    "the first weights also drive with dynamic programming, beside the sampled "
+    "candidates and alone",
 )
 _FILTER = flags.DEFINE_enum(
     "filter", "full", TRACKS, "full, or collision: the reward decides the rest"

@@ -115,7 +115,6 @@ from rcirl_jax.simulation.suite import (
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.types import Candidates, Normaliser, RewardParams, Scene
 
-DP_EVERY = 10  # steps between two plans of the DP row: it costs 1,000 rankings
 NO_WEIGHTS = "paper21"  # features of "random weights" in a table without any
 FIELDS = tuple(field.name for field in dataclasses.fields(Idm))
 _POSITIVE = Annotated[float, msgspec.Meta(gt=0.0, lt=1e6)]
@@ -166,7 +165,6 @@ def incumbent_score(name: str, own: OwnCost | None = None) -> tuple[Score, Param
 def table_rows(
     weights: Sequence[str],
     baselines: Sequence[str],
-    plan_every: int = 1,
     *,
     dp: bool = False,
     tuned_idm: Idm | None = None,
@@ -178,11 +176,12 @@ def table_rows(
     """Learned rows first, in the order of the files, planners, then the baselines.
 
     Rows are named as by `row_names`, or bear `names`, one per file. The first drives
-    again by `dp`. A tuned IDM comes last. `track` is the safety filter's
-    (`SafetyConfig`). `planners` are names of rows ("" for their own) and places of
-    programs (`planner.program`) or own costs (`planner.own_cost`). Weights plan what
-    they were trained to plan, other rows that rank candidates what `mode` says or else
-    the first file's; the rest plan speed along the given path.
+    again with search and by the plans of search alone (`dp`). A tuned IDM comes last.
+    `track` is the safety filter's (`SafetyConfig`). `planners` are names of rows ("" for
+    their own) and places of programs (`planner.program`) or own costs
+    (`planner.own_cost`). Weights plan what they were trained to plan, other rows that
+    rank candidates what `mode` says or else the first file's; the rest plan speed along
+    the given path.
 
     Raises:
       InputError: no file and no planner, an unreadable one, one twice without `names`,
@@ -209,18 +208,23 @@ def table_rows(
     in_speed = config_of(first, "speed")
     if dp and first is None:
         raise InputError("dp: without weights: expected a weights file")
-    if dp and first is not None and first.mode != "speed":
-        raise InputError(f"dp: {first.file}: mode: {first.mode}: expected speed")
-    if dp and first is not None and first.prior_cost is not None:
-        raise InputError(
-            f"dp: {first.file}: expected a reward without a prior cost: the own cost "
-            "is no sum over points"
+    if dp and first is not None:
+        prior_cost = first.prior_cost
+        made = functools.partial(
+            dp_policy,
+            feature_map(preset),
+            activation,
+            config_of(first, first.mode),
+            DpConfig(),
+            own=prior_cost.incumbent if prior_cost else "constant V",
         )
-    if dp:
-        policy = dp_policy(feature_map(preset), activation, in_speed, DpConfig())
-        every, name = max(plan_every, DP_EVERY), f"{rows[0].name} DP"
-        row = Row(name=name, policy=policy, params=params, plan_every=every)
-        rows.insert(1, row)
+        known = rows[0]
+        rows[1:1] = [
+            dataclasses.replace(known, name=f"{known.name} search", policy=made()),
+            dataclasses.replace(
+                known, name=f"{known.name} DP", policy=made(alone=True)
+            ),
+        ]
     for name, place in planners:
         if is_place(place):
             own = dataclasses.replace(config, own=own_cost(place))
@@ -238,7 +242,7 @@ def table_rows(
     if tuned_idm is not None:
         rows.append(rule_row(TUNED_IDM_ROW, "IDM", Yielding(idm=tuned_idm)))
     called = [row.name for row in rows]
-    of_planners = called[len(rewards) + dp :]
+    of_planners = called[len(rewards) + 2 * dp :]
     for (_, place), name in zip(planners, of_planners, strict=False):
         if called.count(name) > 1:
             raise InputError(
@@ -300,7 +304,6 @@ class SuiteJob:
         rows = table_rows(
             self.weights,
             self.baselines,
-            self.plan_every,
             dp=self.dp,
             names=self.names,
             track=self.track,

@@ -1,17 +1,22 @@
-"""Dynamic programming on the ST graph with state (s, v, a), which is exact.
+"""Search: the plan of the highest sum on a lattice, by dynamic programming.
 
-    V_i(n, m, k-) = max_k  gamma_i R(f_i(n, m, k, k-)) + V_{i+1}(n + m + k, m + k, k)
+    V_i(n, m, k-) = max_k  [ own_i + gain gamma_i R(f_i) ](n, m, k, k-)
+                           + V_{i+1}(n + m + k, m + k, k)
 
-over accelerations k with m + k >= 0, |k - k-| within the jerk limit, free of
-bodies and walls at the next station and within the speed rule (`Lattice`). Apollo's
-speed DP keeps (t, s) only and reads v and a off its single best predecessor, so
-it is not optimal for its own cost.
+over accelerations k with m + k >= 0, |k - k-| within the jerk limit, free of bodies and
+walls at the next station and halfway to it, and within the speed rule. own is the
+planner's own cost as a sum over times (`reward.time_sums`), gain that of
+`planner.rank`; a reward without a prior cost has own 0 and gain 1. Apollo's speed DP
+keeps (t, s) only and reads v and a off its single best predecessor, so it is not
+optimal for its own cost.
 
-One backward `lax.scan` over time makes an int8 policy, one forward scan reads
-the plan off it; the plan's Trajectory goes through the operator shared with all
-candidates, and its value is the network's own.
+One backward `lax.scan` over time makes an int8 policy, one forward scan reads plans off
+it: the best of each of the most valued beginnings. A lattice's plan has jerk in steps,
+so each comes once more, smoothed (`smoothed`). Search proposes, ranking chooses: all
+join the sampled candidates, pass the same filter and are valued by the same score
+(`dp_policy`).
 
-The station-time grid on which the additive learned reward is exact.
+The station-time grid on which sums over times are exact.
 
 The operator of `sampling.kinematics` makes v, a and j of a time from the
 stations around it. With w_i = (s_i - s_{i-1}) / dt and a_{i-1} known,
@@ -48,6 +53,8 @@ import math
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap
@@ -56,25 +63,34 @@ from rcirl_jax.planner.plan import Plan, PreviousPlan, committed
 from rcirl_jax.planner.rank import (
     Policy,
     RankConfig,
+    Ranking,
     best_plan,
     learned_score,
+    ranking_score,
     with_plan_in_force,
 )
-from rcirl_jax.planner.safety import SafetyConfig, check
+from rcirl_jax.planner.safety import MOVING_MPS, SafetyConfig, check
 from rcirl_jax.reward import normalise
+from rcirl_jax.reward.familiarity import familiarity
 from rcirl_jax.reward.network import (
     ACTIVATIONS,
     feature_gates,
     layers_of,
     matmul_f32,
 )
+from rcirl_jax.reward.time_sums import TIME_SUMS, Grid, TimeSum
 from rcirl_jax.sampling import sample
-from rcirl_jax.sampling.kinematics import trajectory_on_path
+from rcirl_jax.sampling.kinematics import (
+    running_max,
+    trajectory_from_positions,
+    trajectory_on_path,
+)
 from rcirl_jax.sampling.sampler import (
     SamplerConfig,
     as_candidates,
     emergency,
     family_index,
+    within_limits,
 )
 from rcirl_jax.types import (
     Candidates,
@@ -84,10 +100,11 @@ from rcirl_jax.types import (
     Scene,
     Trajectory,
 )
-from rcirl_jax.units import DT_S, NUM_TIMES, TIMES_S
+from rcirl_jax.units import DT_S, NUM_TIMES, STATION_STEP_M, TIMES_S
 
 FORBIDDEN = -1e6  # value of a state that no plan may take; finite: no NaN
 FEASIBLE = -1e5  # values above it belong to plans that break nothing
+LARGEST = 1e4  # that own costs may come to
 
 Weights = tuple[RewardParams, Normaliser]
 
@@ -106,6 +123,8 @@ class DpConfig:
     max_way: float = 250.0  # m, longest way of the lattice in 8 s
     # m/s, how far the first interval's mean speed may be from v0 + a0 dt / 2
     first_reach: float = 1.5
+    # plans read off the lattice: of as many beginnings, the most valued first
+    proposals: int = 8
     safety: SafetyConfig = dataclasses.field(default_factory=SafetyConfig)
 
     def __post_init__(self) -> None:
@@ -147,6 +166,17 @@ class DpConfig:
         return max(1, math.floor(self.max_jerk * DT_S / self.step + 1e-9))
 
 
+class Objective(flax.struct.PyTreeNode, kw_only=True):
+    """What is added up besides the learned reward; of one scene."""
+
+    gain: ArrayLike = 1.0  # [] of V
+    reference: Trajectory | None = None  # leaves [T], where the own cost is no sum
+    own: str = flax.struct.field(pytree_node=False, default="constant V")
+
+
+V_ALONE = Objective()
+
+
 class Lattice(flax.struct.PyTreeNode, kw_only=True):
     """The tables that the recursion reads, made once per scene."""
 
@@ -154,10 +184,13 @@ class Lattice(flax.struct.PyTreeNode, kw_only=True):
     c1: jax.Array  # [T, N, F] their slope by v
     c2: jax.Array  # [T, N, F] and half second derivative
     blocked: jax.Array  # [T, N] bool: a body or a wall is there
+    blocked_after: jax.Array  # [T - 1, 2 N + M] bool: half a time later, twice as fine
     speed_cap: jax.Array  # [T, N] m/s
     first: Trajectory  # leaves []: the ego at t = 0, without its jerk
     first_row: jax.Array  # [F] features at t = 0 with jerk 0
-    weight: jax.Array  # [T] gamma where valid, else 0
+    weight: jax.Array  # [T] gain gamma where valid, else 0; over `unit`
+    own: TimeSum  # over `unit`
+    unit: jax.Array  # [] in which values are added up, far above FORBIDDEN
     has_next: jax.Array  # [T] bool
 
 
@@ -174,9 +207,13 @@ def _grid_rows(
 
 
 def make_lattice(
-    scene: Scene, weights: Weights, features: FeatureMap, config: DpConfig
+    scene: Scene,
+    weights: Weights,
+    features: FeatureMap,
+    config: DpConfig,
+    objective: Objective = V_ALONE,
 ) -> Lattice:
-    """Evaluate F on the lattice and mark what is forbidden."""
+    """Evaluate F and the own cost on the lattice and mark what is forbidden."""
     stations = scene.ego.s + jnp.arange(config.num_stations) * config.station_step
     f0, f1, f2 = (_grid_rows(features, scene, stations, v) for v in (0.0, 1.0, 2.0))
     c2 = 0.5 * (f2 - 2.0 * f1 + f0)
@@ -185,52 +222,85 @@ def make_lattice(
         v=ego.v.at[0].set(scene.ego.v), a=ego.a.at[0].set(scene.ego.a), j=ego.j * 0.0
     )
     valid = scene.time_valid
-    index = features.names.index
-    limit = f0[0, :, index("speed_limit")] if "speed_limit" in features.names else None
+    blocked = _blocked(scene, config)
+    grid = Grid(
+        stations,
+        _speeds(config),
+        jnp.asarray(config.actions, jnp.float32) * config.step,
+    )
+    own = TIME_SUMS[objective.own](scene, grid, objective.reference)
+    largest = jnp.sum(jnp.max(jnp.abs(own.point), axis=(1, 2)))
+    unit = jnp.maximum(largest / LARGEST, 1.0)
+    scaled = {x: getattr(own, x) / unit for x in ("point", "action", "square", "size")}
     return Lattice(
         c0=f0,
         c1=f1 - f0 - c2,
         c2=c2,
-        blocked=_blocked(scene, stations, config),
-        speed_cap=_speed_cap(scene, limit, config),
+        blocked=blocked[::2, : 2 * config.num_stations : 2],
+        blocked_after=blocked[1::2],
+        speed_cap=_speed_cap(scene, stations, config),
         first=jax.tree.map(lambda x: x[0], start),
         first_row=features(scene, start)[0],
-        weight=jnp.where(valid, weights[0]["gamma"], 0.0),
+        weight=jnp.where(valid, objective.gain / unit * weights[0]["gamma"], 0.0),
+        own=own.replace(**scaled),
+        unit=unit,
         has_next=jnp.concatenate([valid[1:], jnp.zeros((1,), bool)]),
     )
 
 
-def _speed_cap(scene: Scene, limit: jax.Array | None, config: DpConfig) -> jax.Array:
-    """[T, N] m/s: the safety filter's speed rule."""
-    times = jnp.asarray(TIMES_S)[:, None]
-    recovering = scene.ego.v - config.safety.speed_recovery * times
-    if limit is None:
-        return jnp.full((NUM_TIMES, config.num_stations), config.max_speed)
-    return jnp.maximum(limit[None] + config.safety.speed_slack, recovering)
+def _speeds(config: DpConfig) -> jax.Array:
+    """Speeds [U] m/s of the tables, from 0 on, half a `speed_step` apart."""
+    count = 2 * config.num_speeds + max(abs(k) for k in config.actions)
+    return 0.5 * config.speed_step * jnp.arange(count, dtype=jnp.float32)
 
 
-def _blocked(scene: Scene, stations: jax.Array, config: DpConfig) -> jax.Array:
-    """[T, N] bool: the ego there and then would touch a body or pass a wall."""
-    obstacles, ego = scene.obstacles, scene.ego
-    path_l = path_view(scene, stations).l
-    half_l = 0.5 * ego.width + config.safety.margin_across
-    half_s = 0.5 * ego.length + config.safety.margin_along
-    s, l = stations[None], path_l[None]
+def _speed_cap(scene: Scene, stations: jax.Array, config: DpConfig) -> jax.Array:
+    """[T, N] m/s: the safety filter's rules of speed limit and lateral acceleration."""
+    safety = config.safety
+    view = path_view(scene, stations)
+    recovering = scene.ego.v - safety.speed_recovery * jnp.asarray(TIMES_S)[:, None]
+    slow = jnp.maximum(view.speed_limit + safety.speed_slack, recovering)
+    bend = jnp.maximum(jnp.abs(view.kappa), 1e-6)
+    return jnp.minimum(slow, jnp.sqrt(safety.max_lateral_acceleration / bend))
+
+
+def _blocked(scene: Scene, config: DpConfig) -> jax.Array:
+    """[2 T - 1, 2 N + M] bool: the ego there and then touches a body or passes a wall.
+
+    At the times and halfway between two, where what moves is between its two places, on
+    stations of half a step.
+    """
+    obstacles, ego, safety = scene.obstacles, scene.ego, config.safety
+    count = 2 * config.num_stations + config.num_speeds
+    s = ego.s + 0.5 * config.station_step * jnp.arange(count)
+    l = path_view(scene, s).l
+    half_l = 0.5 * ego.width + safety.margin_across
     front = s + 0.5 * ego.length
-    out = jnp.zeros((NUM_TIMES, stations.shape[0]), bool)
+    times = 0.5 * DT_S * jnp.arange(2 * NUM_TIMES - 1)[:, None]
+
+    def between(x: jax.Array) -> jax.Array:
+        middle = jnp.append(0.5 * (x[1:] + x[:-1]), 0.0)
+        return jnp.stack([x, middle], axis=-1).reshape(-1)[:-1, None]
+
+    out = jnp.zeros((2 * NUM_TIMES - 1, count), bool)
     for n in range(obstacles.kind.shape[0]):
-        low, high = obstacles.s_lower[n][:, None], obstacles.s_upper[n][:, None]
-        right, left = obstacles.l_lower[n][:, None], obstacles.l_upper[n][:, None]
-        kind, known = obstacles.kind[n], obstacles.valid[n][:, None]
+        low, high = between(obstacles.s_lower[n]), between(obstacles.s_upper[n])
+        right, left = between(obstacles.l_lower[n]), between(obstacles.l_upper[n])
+        known = between(obstacles.valid[n].astype(jnp.float32)) == 1.0
+        kind = obstacles.kind[n]
         body = known & (kind >= Kind.VEHICLE) & (kind <= Kind.STATIC)
+        moves = (jnp.abs(obstacles.speed[n, 0]) > MOVING_MPS) & (kind != Kind.STATIC)
+        grown = jnp.where(moves, safety.margin_growth * times, 0.0)
+        half_s = 0.5 * ego.length + safety.margin_along + grown
         middle = 0.5 * (low[0, 0] + high[0, 0])
         aside_now = jnp.maximum(right[0, 0] - ego.l, ego.l - left[0, 0])
         from_behind = (middle < ego.s) & (aside_now < 0.5 * ego.width)
         inside = (s + half_s > low) & (s - half_s < high)
         inside = inside & (l + half_l > right) & (l - half_l < left)
-        before = ego.s + 0.5 * ego.length <= low[0, 0]
-        wall = known & (kind == Kind.STOP) & before
-        out = out | (body & inside & ~from_behind) | (wall & (front > low))
+        way = low[0, 0] - ego.s - 0.5 * ego.length  # to a line
+        slack = jnp.minimum(safety.line_margin, 0.5 * way)
+        wall = known & (kind == Kind.STOP) & (way >= 0.0)
+        out = out | (body & inside & ~from_behind) | (wall & (front > low - slack))
     return out
 
 
@@ -296,10 +366,8 @@ def base_activation(
     lattice: Lattice, layers: Layers, t: jax.Array, config: DpConfig
 ) -> jax.Array:
     """Pre-activations [N, U, H] at time t without a and j; u = 2 v / speed_step."""
-    u = jnp.arange(2 * config.num_speeds + max(abs(k) for k in config.actions))
-    v = 0.5 * config.speed_step * u.astype(jnp.float32)
+    v = _speeds(config)[None, :, None]
     c0, c1, c2 = lattice.c0[t], lattice.c1[t], lattice.c2[t]
-    v = v[None, :, None]
     x = c0[:, None] + c1[:, None] * v + c2[:, None] * v**2
     x = jnp.clip(x, layers.lower, layers.upper)
     return matmul_f32(x, layers.first) + layers.offset
@@ -316,10 +384,10 @@ MAX_ACTIVATION = 43.0  # 1, exp of twice it is still a normal float32
 
 
 class DpPlan(flax.struct.PyTreeNode, kw_only=True):
-    """The best plan of the lattice."""
+    """A plan of the lattice, or several with a first axis more."""
 
     trajectory: Trajectory  # [T]
-    value: jax.Array  # [] V of the plan, as the recursion added it up
+    value: jax.Array  # [] of the plan, as the recursion added it up
     feasible: jax.Array  # [] bool: nothing forbidden on the way
     n: jax.Array  # [T] int32, stations on the lattice
 
@@ -369,13 +437,9 @@ def _edge_rewards(
       config: static.
       activation: static.
     """
-    speeds = config.num_speeds
-    lowest = min(0, config.actions[0])  # u < 0: rows of negative speeds, not taken
-    rows = slice(k - lowest, k - lowest + 2 * speeds - 1, 2)
-    pad = ((-lowest, 0), (0, 0))
     a = jnp.full(before.shape, k * config.step)
     if not _is_rational(layers, activation):
-        x = jnp.pad(table, (*pad, (0, 0)), mode="edge")[rows]
+        x = _at_speeds(table, k, config)
         lift = lambda y: y[:, None, None]  # noqa: E731
         return _reward(x[None], layers, lift(a), lift(before), activation)
     motion = motion_activation(layers, a, (a - before) / DT_S)
@@ -383,31 +447,61 @@ def _edge_rewards(
     weights = layers.kernels[0][:, 0]
     total = jnp.sum(weights)
     for h in range(weights.shape[0]):
-        x = jnp.pad(table[h], pad, mode="edge")[rows]
+        x = _at_speeds(table[h], k, config)
         total = total - 2.0 * weights[h] / (1.0 + x[None] * motion[:, h, None, None])
     return total
 
 
+def _at_speeds(table: jax.Array, k: int, config: DpConfig) -> jax.Array:
+    """Rows [M, ...] of a table [U, ...] at v = w + a dt / 2, u = 2 m + k.
+
+    Those of negative speeds are not taken; they get the row of 0.
+    """
+    lowest = min(0, config.actions[0])
+    padding = [(-lowest, 0)] + [(0, 0)] * (table.ndim - 1)
+    first = k - lowest
+    padded = jnp.pad(table, padding, mode="edge")
+    return padded[first : first + 2 * config.num_speeds - 1 : 2]
+
+
+def _own_share(
+    lattice: Lattice, t: jax.Array, i: int, before: jax.Array, config: DpConfig
+) -> jax.Array:
+    """The own cost's share [B, M, N] of action i after `before` [B] m/s^2 at time t."""
+    own, k = lattice.own, config.actions[i]
+    jerk = own.of_jerk((k * config.step - before) / DT_S)
+    of_motion = own.counts[t] * (own.action[i] + jerk)
+    return of_motion[:, None, None] + _at_speeds(own.point[t], k, config)
+
+
 def _keeps_speed(lattice: Lattice, t: jax.Array, k: int, config: DpConfig) -> jax.Array:
-    """[M, N] bool: v = w + a dt / 2 at time t is not negative and keeps the cap."""
-    v = ((jnp.arange(config.num_speeds) + 0.5 * k) * config.speed_step)[:, None]
-    return (v >= 0.0) & (v <= lattice.speed_cap[t][None] + 1e-4)
+    """[M, N] bool: v = w + a dt / 2 at time t is not negative and keeps the cap.
+
+    So does the mean speed w up to there: between two times the speed is at most the
+    larger of both.
+    """
+    w = (jnp.arange(config.num_speeds) * config.speed_step)[:, None]
+    v = w + 0.5 * k * config.speed_step
+    return (v >= 0.0) & (jnp.maximum(v, w) <= lattice.speed_cap[t][None] + 1e-4)
 
 
-def _next_values(values: jax.Array, blocked: jax.Array) -> jax.Array:
-    """V_{i+1} [K, M, N] seen from where it is entered: at (m', n + m') for (m', n).
+def _next_values(values: jax.Array, lattice: Lattice, t: jax.Array) -> jax.Array:
+    """V_{t+1} [K, M, N] seen from where it is entered: at (m', n + m') for (m', n).
 
     Shifting row m' by m' is a change of row length: in memory (m', n + m') of
-    rows of length L is (m', n) of rows of length L + 1. FORBIDDEN off the lattice
-    and where `blocked` [N].
+    rows of length L is (m', n) of rows of length L + 1. FORBIDDEN off the lattice,
+    where the ego may not be at t + 1, and where it may not be halfway, at 2 n + m'
+    half stations.
     """
     actions, speeds, count = values.shape
-    entered = jnp.where(blocked, FORBIDDEN, values)
+    entered = jnp.where(lattice.blocked[t + 1], FORBIDDEN, values)
     length = count + speeds
     padding = ((0, 0), (0, 0), (0, speeds))
     entered = jnp.pad(entered, padding, constant_values=FORBIDDEN)
     flat = jnp.pad(entered.reshape(actions, -1), ((0, 0), (0, speeds)))
-    return flat.reshape(actions, speeds, length + 1)[..., :count]
+    free = flat.reshape(actions, speeds, length + 1)[..., :count]
+    halfway = 2 * jnp.arange(count) + jnp.arange(speeds)[:, None]
+    return jnp.where(lattice.blocked_after[t][halfway], FORBIDDEN, free)
 
 
 def _shift(x: jax.Array, k: int) -> jax.Array:
@@ -432,16 +526,16 @@ def _carried(
     config: DpConfig,
     activation: str,
 ) -> jax.Array:
-    """Gamma R [K, M, N] of the last counted time: the acceleration is carried over."""
+    """What the last counted time adds [K, M, N]: the acceleration is carried over."""
 
-    def of(k: int) -> jax.Array:
+    def of(i: int, k: int) -> jax.Array:
         a = jnp.full((1,), k * config.step)
-        reward = _edge_rewards(table, layers, k, a, config, activation)[0]
+        reward = _edge_rewards(table, layers, k, a, config, activation)
+        total = lattice.weight[t] * reward + _own_share(lattice, t, i, a, config)
         # the limits after the weight, which may be small or negative
-        keeps = _keeps_speed(lattice, t, k, config)
-        return jnp.where(keeps, lattice.weight[t] * reward, FORBIDDEN)
+        return jnp.where(_keeps_speed(lattice, t, k, config), total[0], FORBIDDEN)
 
-    return jnp.stack([of(k) for k in config.actions])
+    return jnp.stack([of(i, k) for i, k in enumerate(config.actions)])
 
 
 def backward(
@@ -460,8 +554,7 @@ def backward(
 
     def stage(values: jax.Array, t: jax.Array) -> tuple[jax.Array, jax.Array]:
         table = prepared(t)
-        ahead = _next_values(values, lattice.blocked[t + 1])
-        weight = jnp.where(lattice.has_next[t], lattice.weight[t], 0.0)
+        ahead = _next_values(values, lattice, t)
         best = jnp.full(values.shape, FORBIDDEN)
         choice = jnp.zeros(values.shape, jnp.int8)
         for i, k in enumerate(config.actions):
@@ -471,7 +564,10 @@ def backward(
             )
             keeps = _keeps_speed(lattice, t, k, config)
             free = jnp.where(keeps, _shift(ahead[i], k), FORBIDDEN)
-            q = weight * reward + free
+            now = lattice.weight[t] * reward + _own_share(
+                lattice, t, i, accelerations[span], config
+            )
+            q = jnp.where(lattice.has_next[t], now, 0.0) + free
             choice = choice.at[span].set(
                 jnp.where(q > best[span], jnp.int8(i), choice[span])
             )
@@ -494,7 +590,7 @@ def _first_step(
     config: DpConfig,
     activation: str,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Value, mean speed m_1 and action index of the best beginning.
+    """Value, mean speed m_1 and action index of the best beginnings, all [P].
 
     At time 1 the acceleration before is the ego's own, a_0, which lies off the
     lattice; the jerk of time 0 is that of time 1. Station and mean speed are the
@@ -505,10 +601,10 @@ def _first_step(
     m = jnp.arange(config.num_speeds)
     off = jnp.abs(m * config.speed_step - (v0 + 0.5 * a0 * DT_S))
     near = (off <= config.first_reach) | (m == jnp.argmin(off))
-    free = near & ~lattice.blocked[1, m]
+    free = near & ~lattice.blocked[1, m] & ~lattice.blocked_after[0, m]
     clipped = jnp.clip(lattice.first_row, layers.lower, layers.upper)
     start = matmul_f32(clipped, layers.first) + layers.offset
-    ahead = _next_values(values, lattice.blocked[2])
+    ahead = _next_values(values, lattice, jnp.asarray(1))
     scores = []
     for i, k in enumerate(config.actions):
         a = jnp.asarray(k * config.step)
@@ -518,19 +614,22 @@ def _first_step(
             layers, start + motion_activation(layers, a0, j), activation
         )
         now = lattice.weight[1] * _reward(rows, layers, a, a0, activation)
-        q = lattice.weight[0] * of_start + now + _shift(ahead[i], k)[m, m]
+        own = _own_share(lattice, jnp.asarray(1), i, a0[None], config)[0, m, m]
+        own = own + lattice.own.counts[0] * lattice.own.of_jerk(j)
+        begins = lattice.weight[0] * of_start + now + own
+        q = begins + _shift(ahead[i], k)[m, m]
         steady = jnp.abs(j) <= jnp.maximum(config.max_jerk, config.step / DT_S)
         keeps = _keeps_speed(lattice, jnp.asarray(1), k, config)[m, m]
         scores.append(jnp.where(free & keeps & steady, q, FORBIDDEN))
     table = jnp.stack(scores, axis=-1)  # [M, K]
-    best = jnp.argmax(table)
-    return table.reshape(-1)[best], best // table.shape[1], best % table.shape[1]
+    values, best = jax.lax.top_k(table.reshape(-1), config.proposals)
+    return values, best // table.shape[1], best % table.shape[1]
 
 
 def solve(
     lattice: Lattice, layers: Layers, config: DpConfig, activation: str
 ) -> tuple[jax.Array, jax.Array]:
-    """(value, n [T]): the best sequence of lattice stations."""
+    """(values [P], n [P, T]): the best stations of each of the best beginnings."""
     values, policies = backward(lattice, layers, config, activation)
     value, m1, first = _first_step(lattice, layers, values, config, activation)
     actions = jnp.asarray(config.actions)
@@ -547,7 +646,42 @@ def solve(
 
     _, rest = jax.lax.scan(read, (n2, m2, first), policies)
     head = jnp.stack([jnp.zeros_like(m1), m1, n2])
-    return value, jnp.concatenate([head, rest])
+    return value, jnp.concatenate([head, rest]).T
+
+
+def search(
+    scene: Scene,
+    weights: Weights,
+    features: FeatureMap,
+    activation: str,
+    config: DpConfig,
+    objective: Objective = V_ALONE,
+) -> DpPlan:
+    """The plans of the highest sum on the lattice, one for each of P beginnings.
+
+    Args:
+      scene: one scene; its path is the one driven (mode "speed").
+      weights: effective parameters and normaliser.
+      features: static.
+      activation: static, key of ACTIVATIONS.
+      config: static.
+      objective: the own cost and the gain of V.
+
+    Returns:
+      Plans with leaves [P], the best first; where `feasible` is False every plan of
+      that beginning breaks a limit, and its trajectory is meaningless.
+    """
+    with jax.named_scope("dp"):
+        lattice = make_lattice(scene, weights, features, config, objective)
+        layers = make_layers(weights, features, lattice.first_row)
+        value, n = solve(lattice, layers, config, activation)
+        s = scene.ego.s + n * config.station_step
+        return DpPlan(
+            trajectory=jax.vmap(trajectory_on_path, (None, 0))(scene, s),
+            value=lattice.unit * value,
+            feasible=value > FEASIBLE,
+            n=n,
+        )
 
 
 def plan_dp(
@@ -556,55 +690,127 @@ def plan_dp(
     features: FeatureMap,
     activation: str,
     config: DpConfig,
+    objective: Objective = V_ALONE,
 ) -> DpPlan:
-    """The plan of highest learned value on the lattice.
+    """The best plan of `search`, with the same arguments."""
+    config = dataclasses.replace(config, proposals=1)
+    plans = search(scene, weights, features, activation, config, objective)
+    return jax.tree.map(lambda x: x[0], plans)
 
-    Args:
-      scene: one scene; its path is the one driven (mode "speed").
-      weights: effective parameters and normaliser.
-      features: static.
-      activation: static, key of ACTIVATIONS.
-      config: static.
 
-    Returns:
-      The plan; `feasible` is False if every plan breaks a limit; its trajectory is then
-      meaningless.
+SMOOTHNESS = 0.02  # s^6, weight of jerk squared against metres squared
+
+
+def _smoother() -> tuple[np.ndarray, np.ndarray]:
+    """Matrices [T, T] of stations and [T, 2] of what is given, of `smoothed`.
+
+    The x of least |x - s|^2 + c |D (g, x)|^2, with the two given stations g before them
+    and D the third differences over dt^3, solves linear equations.
     """
-    with jax.named_scope("dp"):
-        lattice = make_lattice(scene, weights, features, config)
-        layers = make_layers(weights, features, lattice.first_row)
-        value, n = solve(lattice, layers, config, activation)
-        s = scene.ego.s + n * config.station_step
-        return DpPlan(
-            trajectory=trajectory_on_path(scene, s),
-            value=value,
-            feasible=value > FEASIBLE,
-            n=n,
-        )
+    times = NUM_TIMES + 1
+    jerk = np.diff(np.eye(times), 3, axis=0) / DT_S**3
+    given, free = jerk[:, :2], jerk[:, 2:]
+    equations = np.eye(NUM_TIMES - 1) + SMOOTHNESS * free.T @ free
+    inverse = np.linalg.inv(equations)
+    return inverse, -SMOOTHNESS * inverse @ free.T @ given
+
+
+_OF_STATIONS, _OF_GIVEN = _smoother()
+
+
+def smoothed(scene: Scene, s: jax.Array) -> jax.Array:
+    """Stations [..., T] m near `s` with less jerk, from the ego's own v and a on.
+
+        min_x  |x - s|^2 + c sum_i jerk_i(x)^2
+
+    with x_0 = s_0 and x_{-1} = x_0 - v_0 dt + a_0 dt^2 / 2, and never backwards.
+    """
+    ego = scene.ego
+    before = ego.s - ego.v * DT_S + 0.5 * ego.a * DT_S**2
+    given = jnp.asarray(_OF_GIVEN, jnp.float32) @ jnp.stack([before, ego.s])
+    smooth = s[..., 1:] @ jnp.asarray(_OF_STATIONS, jnp.float32).T + given
+    return running_max(jnp.concatenate([s[..., :1], smooth], axis=-1))
+
+
+def along(scene: Scene, trajectory: Trajectory) -> Scene:
+    """The same scene whose given path is that of a trajectory [T]."""
+    stations = STATION_STEP_M * jnp.arange(scene.path.l.shape[0])
+    l = jnp.interp(stations, running_max(trajectory.s), trajectory.l)
+    return scene.replace(path=scene.path.replace(l=l))
+
+
+def _on(scene: Scene, on_path: Scene, s: jax.Array, steers: bool) -> Trajectory:
+    """The trajectory through stations [T] on the path of `on_path`."""
+    if not steers:
+        return trajectory_on_path(scene, s)
+    l = path_view(on_path, s).l.at[0].set(scene.ego.l)
+    return trajectory_from_positions(scene, s, l)
 
 
 @functools.lru_cache(maxsize=16)
 def dp_policy(
-    features: FeatureMap, activation: str, rank: RankConfig, config: DpConfig
+    features: FeatureMap,
+    activation: str,
+    rank: RankConfig,
+    config: DpConfig,
+    own: str = "constant V",
+    alone: bool = False,
 ) -> Policy:
-    """The planner that adds the lattice's best plan to the sampled candidates.
+    """The planner by a `Ranking` to whose sampled candidates search adds its plans.
 
-    The plan is one more candidate: it passes the same safety filter and is
-    driven if its value is the highest of all that pass.
+    Plans of the lattice and their smoothed twins are candidates like others: they pass
+    the same safety filter, and the one of the highest score is driven. Where paths are
+    planned, speed is searched along the path of the best sampled candidate, path first
+    and speed second as in Apollo's EM planner.
+
+    Args:
+      features: static.
+      activation: key of ACTIVATIONS.
+      rank: sampler and filter.
+      config: lattice.
+      own: the prior cost of the rankings that will drive, of TIME_SUMS.
+      alone: of the sampled candidates only emergency stops may be driven.
+
+    Raises:
+      InputError: the own cost is no sum over times.
     """
-    score = learned_score(features, activation)
+    if own not in TIME_SUMS:
+        raise InputError(
+            f"dp: {own}: expected {', '.join(TIME_SUMS)}: other own costs are no sums "
+            "over times, which alone can be searched"
+        )
+    score = ranking_score(features, activation, rank.own)
 
     def replan(
-        params: Weights, scene: Scene, key: jax.Array, in_force: PreviousPlan | None
+        params: Ranking, scene: Scene, key: jax.Array, in_force: PreviousPlan | None
     ) -> Plan:
         sampled = sample(key, scene, rank.sampler)
-        plan = plan_dp(scene, params, features, activation, config)
-        join = lambda many, one: jnp.concatenate([many, one[None]])  # noqa: E731
-        candidates = Candidates(
-            trajectory=jax.tree.map(join, sampled.trajectory, plan.trajectory),
-            feasible=join(sampled.feasible, plan.feasible),
-            family=join(sampled.family, jnp.asarray(family_index("cruise"))),
+        if alone:
+            stops = sampled.family == family_index("emergency")
+            sampled = sampled.replace(feasible=sampled.feasible & stops)
+        scores = score(params, scene, sampled)
+        admissible = check(scene, sampled, rank.safety).admissible
+        nearest = jnp.argmax(jnp.where(admissible, scores, -jnp.inf))
+        reference = jax.tree.map(lambda x: x[nearest], sampled.trajectory)
+        on_path = along(scene, reference) if rank.steers else scene
+        x0 = features(scene, jax.tree.map(lambda x: x[0], sampled.trajectory))[0]
+        share = familiarity(params.familiarity, x0)
+        objective = Objective(
+            gain=params.low + (params.high - params.low) * share,
+            reference=reference,
+            own=own,
         )
+        weights = (params.reward, params.normaliser)
+        plans = search(on_path, weights, features, activation, config, objective)
+        stations = plans.trajectory.s
+        s = jnp.concatenate([stations, smoothed(scene, stations)])
+        found = jax.vmap(lambda s: _on(scene, on_path, s, rank.steers))(s)
+        may = jax.vmap(lambda x: within_limits(scene, x, rank.sampler))(found)
+        may = may & jnp.tile(plans.feasible, 2)
+        family = jnp.full(may.shape, family_index("cruise"))
+        proposed = Candidates(trajectory=found, feasible=may, family=family)
+        both = lambda *x: jnp.concatenate(x)  # noqa: E731
+        candidates = jax.tree.map(both, sampled, proposed)
         candidates = with_plan_in_force(candidates, in_force)
         scores = score(params, scene, candidates)
         return best_plan(scene, candidates, scores, rank, in_force)

@@ -72,8 +72,6 @@ class Row:
     params: Params = None
     # the ego is the recorded human; only for cases with a replay
     follow_log: bool = False
-    # steps between two plans, where a row needs its own (DP); None: the run's
-    plan_every: int | None = None
     # the driver's reaction time, in steps, and its braking build-up, m/s^3
     command_delay: int = 0
     braking_jerk: float | None = None

@@ -179,11 +179,10 @@ def recorded_set(drives: HeldOut) -> CaseSet:
 
 def rollout_config(row: Row, duration_s: float, plan_every: int) -> RolloutConfig:
     """Returns the rollout's settings for a row and cases of a duration."""
-    every = row.plan_every or plan_every
     steps = round(duration_s / STEP_S)
     return RolloutConfig(
-        plan_every=every,
-        steps=-(-steps // every) * every,
+        plan_every=plan_every,
+        steps=-(-steps // plan_every) * plan_every,
         follow_log=row.follow_log,
         command_delay=row.command_delay,
         braking_jerk=row.braking_jerk,

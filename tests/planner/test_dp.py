@@ -1,5 +1,6 @@
 """The lattice plan against enumeration, the network and coarser planners."""
 
+import dataclasses
 import functools
 import itertools
 
@@ -8,13 +9,34 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.dp import DpConfig, plan_dp
-from rcirl_jax.planner.rank import learned_score
+from rcirl_jax.features.columns import path_view
+from rcirl_jax.planner.dp import (
+    DpConfig,
+    Objective,
+    backward,
+    dp_policy,
+    make_lattice,
+    make_layers,
+    plan_dp,
+    search,
+    smoothed,
+)
+from rcirl_jax.planner.rank import (
+    ONLINE,
+    RankConfig,
+    learned_score,
+    ranking,
+    ranking_score,
+)
+from rcirl_jax.planner.safety import check
 from rcirl_jax.reward import RewardConfig, effective_params, init_params
+from rcirl_jax.sampling import sample
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.sampling.sampler import as_candidates
-from rcirl_jax.types import Normaliser
+from rcirl_jax.types import Candidates, Normaliser
+from rcirl_jax.units import DT_S
 from tests.helpers.scenes import random_scene
 
 FEATURES = feature_map("paper21")
@@ -118,8 +140,13 @@ def enumerate_best(made, config, depth, w):
                 plans.append(stations)
     s = jnp.asarray(plans, jnp.float32) * step_s + made.ego.s
     trajectory = jax.jit(jax.vmap(trajectory_on_path, (None, 0)))(made, s)
-    # the lattice takes no plan whose speed turns negative at the last counted time
-    counted = np.asarray(trajectory.v)[:, : depth + 2].min(axis=1) > -1e-3
+    # the lattice takes no plan whose speed turns negative at the last counted time, or
+    # that is too fast for a bend
+    v = np.asarray(trajectory.v)[:, 1 : depth + 2]
+    fastest = np.maximum(v, np.diff(np.asarray(s))[:, : depth + 1] * 17 / 8)
+    kappa = np.abs(np.asarray(jax.vmap(path_view, (None, 0))(made, s).kappa))
+    bend = fastest**2 * kappa[:, 1 : depth + 2]
+    counted = (v.min(axis=1) > -1e-3) & (bend.max(axis=1) < 4.0)
     values = np.asarray(SCORE(w, made, as_candidates(trajectory)))
     return values[counted], np.asarray(plans)[counted]
 
@@ -164,3 +191,184 @@ def test_walls_and_bodies_are_not_entered():
         row = VALUES(ahead, plan.trajectory)
         names = FEATURES.names
         assert float(row[1:, names.index("collision_distance")].min()) > 0.0
+
+
+def total(made, trajectory, w, own, gain):
+    """V_own + gain V of one trajectory, as the planner values it."""
+    one = as_candidates(trajectory)
+    params = ranking(w, own, (gain, gain))
+    return float(RANKED(params, made, one)[0])
+
+
+RANKED = jax.jit(ranking_score(FEATURES, SHAPE.activation))
+
+
+@pytest.mark.parametrize("own", ["+velocity", "hand-set DP"])
+def test_an_own_cost_that_is_a_sum_is_searched_exactly(own):
+    """The recursion adds up what the planner's score says of the plan."""
+    gain, found = 3.0, 0
+    plan_of = jax.jit(
+        lambda made, w: plan_dp(
+            made, w, FEATURES, SHAPE.activation, COARSE, Objective(gain=gain, own=own)
+        )
+    )
+    for seed in range(5):
+        made, w = scene_of(seed), weights(seed)
+        plan = plan_of(made, w)
+        if bool(plan.feasible):
+            found += 1
+            value = total(made, plan.trajectory, w, own, gain)
+            if own == "+velocity":  # all plans have the same speed at t = 0
+                value -= float(made.ego.v) / 18
+            assert float(plan.value) == pytest.approx(value, rel=1e-4, abs=1e-4)
+    assert found >= 2
+
+
+def test_ratios_are_linear_about_the_reference():
+    """A step away from it, the sum moves by as much as Apollo's cost does."""
+    made = free(scene_of(2))
+    w, s0, v0 = weights(2), float(made.ego.s), 10.0
+    made = made.replace(
+        ego=made.ego.replace(v=jnp.asarray(v0), a=jnp.asarray(0.0)),
+    )
+    lattice = DpConfig(step=1.0, max_speed=26.0, max_way=200.0)
+    m0 = round(v0 / lattice.speed_step)
+
+    def plan(*changes):
+        """A plan on the lattice: accelerations in steps from each time on."""
+        w_i = np.full(17, m0)
+        for at, by in changes:
+            w_i[at:] += by
+        s = s0 + lattice.station_step * np.concatenate([[0], np.cumsum(w_i)])
+        return trajectory_on_path(made, jnp.asarray(s, jnp.float32))
+
+    # jerk and speed change at many times, so that no term is at a kink
+    base = [(2, 1), (5, -2), (8, 3), (11, -2), (14, 2)]
+    reference, moved = plan(*base), plan(*base, (9, 1))
+    sums = make_lattice(
+        made,
+        w,
+        FEATURES,
+        lattice,
+        Objective(gain=0.0, reference=reference, own="hand-set"),
+    ).own
+
+    def sum_of(x):
+        n = np.round((np.asarray(x.s) - s0) / lattice.station_step).astype(int)
+        u = np.round(2 * np.asarray(x.v) / lattice.speed_step).astype(int)
+        points = np.asarray(sums.point)[np.arange(1, 18), u[1:], n[1:]].sum()
+        return points + np.asarray(sums.of_jerk(x.j)).sum()
+
+    of_sum = sum_of(moved) - sum_of(reference)
+    of_cost = total(made, moved, w, "hand-set", 0.0) - total(
+        made, reference, w, "hand-set", 0.0
+    )
+    assert abs(of_cost) > 0.01
+    assert of_sum == pytest.approx(of_cost, rel=0.15)
+
+
+def test_smoothing_keeps_what_is_smooth_and_takes_out_steps():
+    made = scene_of(0)
+    v, a, t = float(made.ego.v), float(made.ego.a), np.arange(18) * 8 / 17
+    even = float(made.ego.s) + v * t + 0.5 * a * t**2
+    assert even[-1] > even.max() - 1e-6  # it never moves backwards
+    kept = np.asarray(smoothed(made, jnp.asarray(even, jnp.float32)))
+    np.testing.assert_allclose(kept, even, atol=2e-3)
+    uneven = even + np.where(np.arange(18) % 4 == 0, 0.15, 0.0)
+    uneven[0] = even[0]
+    smooth = np.asarray(smoothed(made, jnp.asarray(uneven, jnp.float32)))
+    jerk = lambda s: np.abs(np.diff(s, 3)).mean()  # noqa: E731
+    assert jerk(smooth) < 0.2 * jerk(uneven)
+    assert np.abs(smooth - uneven).max() < 0.2
+
+
+def test_search_finds_better_plans_than_the_sampler():
+    """By Apollo's own cost, which is no sum, after smoothing and the filter."""
+    better, judged = 0, 0
+    config = dataclasses.replace(MIDDLE, proposals=4)
+
+    @jax.jit
+    def best(made, w):
+        sampled = sample(jax.random.key(0), made, ONLINE)
+        params = ranking(w, "hand-set", (0.0, 0.0))
+        of = lambda x: jnp.where(  # noqa: E731
+            check(made, x).admissible, RANKED(params, made, x), -jnp.inf
+        )
+        values = of(sampled)
+        at = jnp.argmax(values)
+        reference = jax.tree.map(lambda x: x[at], sampled.trajectory)
+        objective = Objective(gain=0.0, own="hand-set", reference=reference)
+        plans = search(made, w, FEATURES, SHAPE.activation, config, objective)
+        s = smoothed(made, plans.trajectory.s)
+        fine = jax.vmap(trajectory_on_path, (None, 0))(made, s)
+        proposed = Candidates(
+            trajectory=fine, feasible=plans.feasible, family=sampled.family[:4]
+        )
+        return values[at], jnp.max(of(proposed))
+
+    for seed in range(10):
+        ranked, searched = map(float, best(scene_of(seed), weights(seed)))
+        if np.isfinite(ranked) and np.isfinite(searched):
+            judged += 1
+            better += searched > ranked
+    assert judged >= 4
+    assert better > judged / 2
+
+
+def test_other_own_costs_are_not_searched():
+    with pytest.raises(InputError, match=r"dp: costs.py:mine: .* no sums over times"):
+        dp_policy(FEATURES, "tanh", RankConfig(), COARSE, own="costs.py:mine")
+
+
+def test_values_at_full_size_equal_a_recursion_in_float64():
+    """Large sums may not go wrong in fusions of XLA (jax-ml/jax issue 39103)."""
+    made, own, config = scene_of(1), weights(1), DpConfig()
+    objective = Objective(gain=2.0, own="+velocity")
+    lattice = make_lattice(made, own, FEATURES, config, objective)
+    layers = make_layers(own, FEATURES, lattice.first_row)
+    solved = jax.jit(lambda a, b: backward(a, b, config, SHAPE.activation)[0])
+    found = np.asarray(solved(lattice, layers))
+
+    x, y = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), (lattice, layers))
+    actions, count = config.actions, config.num_stations
+    a = np.asarray(actions) * config.step
+    w = np.arange(config.num_speeds) * config.speed_step
+    n, m = np.arange(count), np.arange(config.num_speeds)[:, None]
+    bounded = lambda z, of: np.clip(z, *of)[..., None]  # noqa: E731
+
+    def rewards(t, i):
+        """Of action i after every other [K, M, N], and where speed is kept [M, N]."""
+        v = w + 0.5 * a[i] * DT_S
+        rows = x.c0[t] + x.c1[t] * v[:, None, None] + x.c2[t] * v[:, None, None] ** 2
+        rows = np.clip(rows, y.lower, y.upper) @ y.first + y.offset  # [M, N, H]
+        j = (a[i] - a) / DT_S
+        motion = bounded(a[i], y.bounds_a) * y.of_a + bounded(j, y.bounds_j) * y.of_j
+        total = np.stack([np.tanh(rows + one) @ y.kernels[0][:, 0] for one in motion])
+        total = x.weight[t] * total + np.maximum(v, 0.0)[:, None] * 1.0 / 18.0
+        fits = (v >= 0.0)[:, None] & (
+            np.maximum(v, w)[:, None] <= x.speed_cap[t] + 1e-4
+        )
+        return total, fits
+
+    values = np.empty((len(actions), config.num_speeds, count))
+    for i in range(len(actions)):
+        total, fits = rewards(17, i)
+        values[i] = np.where(fits, total[i], -1e6)
+    for t in range(16, 1, -1):
+        best = np.full(values.shape, -1e6)
+        for i, k in enumerate(actions):
+            to_m, to_n = m + k, n + m + k
+            there = (to_m >= 0) & (to_m < config.num_speeds) & (to_n < count)
+            at_m, at_n = np.where(there, to_m, 0), np.where(there, to_n, 0)
+            there &= ~x.blocked[t + 1].astype(bool)[at_n]
+            there &= ~x.blocked_after[t].astype(bool)[np.where(there, n + at_n, 0)]
+            total, fits = rewards(t, i)
+            ahead = np.where(there & fits, values[i, at_m, at_n], -1e6)
+            for before, of in enumerate(total):
+                if abs(before - i) <= config.jerk_reach:
+                    best[before] = np.maximum(best[before], of + ahead)
+        values = np.maximum(best, -1e6)
+    may = values > -1e5
+    assert 0.05 < may.mean() < 0.95
+    np.testing.assert_array_equal(found > -1e5, may)
+    np.testing.assert_allclose(found[may], values[may], rtol=1e-4, atol=1e-3)

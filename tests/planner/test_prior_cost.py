@@ -95,8 +95,8 @@ def test_a_file_with_a_prior_cost_drives_on_top_of_it(tmp_path, monkeypatch):
     assert everywhere.policy is shipped.policy
     gains = [float(x) for x in (everywhere.params.low, everywhere.params.high)]
     assert gains == [2.0, 2.0]
-    with pytest.raises(InputError, match="without a prior cost"):
-        table_rows([path], [], dp=True)
+    searched = [row.name for row in table_rows([path], [], dp=True)]
+    assert searched == [rows[0].name, f"{rows[0].name} search", f"{rows[0].name} DP"]
     assert reward.prior_cost is not None
     other = dataclasses.replace(reward.prior_cost, incumbent="mine")
     with pytest.raises(InputError, match=r"prior_cost\.incumbent: mine"):

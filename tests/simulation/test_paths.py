@@ -118,7 +118,6 @@ def test_weights_plan_what_they_were_trained_to_plan(tmp_path):
     assert reward.mode == "path_speed"
     assert steers() == [True, True, False, False]
     assert steers(mode="speed") == [True, False, False, False]
-    with pytest.raises(InputError, match=r"dp: .*mode: path_speed: expected speed"):
-        table_rows(*asked, dp=True)
+    assert steers(dp=True) == [True, True, True, True, False, False]
     with pytest.raises(InputError, match=r"mode: path_speed: .* in other simulators"):
         Driver(ROW, [0])

@@ -289,7 +289,7 @@ def held_out_likeness(
     Args:
       drives: of `simulation.recorded.held_out`.
       rows: learned rows, baselines; names are distinct.
-      plan_every: steps of 0.1 s between two plans, of rows that need no other.
+      plan_every: steps of 0.1 s between two plans.
       incumbent: a row that the others are compared with, besides `REFERENCES`.
 
     Raises:
