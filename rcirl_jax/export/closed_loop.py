@@ -177,8 +177,8 @@ def table_rows(
 
     Rows are named as by `row_names`, or bear `names`, one per file. The first drives
     again with search and by the plans of search alone (`dp`). A tuned IDM comes last.
-    `track` is the safety filter's (`SafetyConfig`). `planners` are names of rows ("" for
-    their own) and places of programs (`planner.program`) or own costs
+    `track` is the safety filter's (`SafetyConfig`). `planners` are names of rows (""
+    for their own) and places of programs (`planner.program`) or own costs
     (`planner.own_cost`). Weights plan what they were trained to plan, other rows that
     rank candidates what `mode` says or else the first file's; the rest plan speed along
     the given path.
