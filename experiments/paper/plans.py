@@ -11,7 +11,7 @@ same scene is seen with other errors, M times,
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -20,9 +20,9 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.statistics import combine_seeds
 from rcirl_jax.features import FeatureMap
-from rcirl_jax.planner.dp import DpConfig, optimality_gap
+from rcirl_jax.planner.dp import DpConfig, Weights, optimality_gap
 from rcirl_jax.planner.plan import Plan, command
-from rcirl_jax.planner.rank import Params, Policy, Ranking
+from rcirl_jax.planner.rank import Params, Policy
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.simulation.cases import STEP_S, Case
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
@@ -105,8 +105,8 @@ def _one_by_one(measure: Callable, scenes: Scene) -> dict[str, np.ndarray]:
 
 
 def gaps(
-    policies: Mapping[str, Policy],
-    params: Ranking,
+    policies: Mapping[str, tuple[Policy, Params]],
+    weights: Weights,
     scenes: Scene,
     case: np.ndarray,
     features: FeatureMap,
@@ -124,9 +124,11 @@ def gaps(
     key = jax.random.key(0)
 
     @jax.jit
-    def measure(params: Ranking, scene: Scene) -> dict[str, jax.Array]:
-        weights = (params.reward, params.normaliser)
-        plans = [policy(params, scene, key).s for policy in policies.values()]
+    def measure(
+        weights: Weights, params: Sequence[Params], scene: Scene
+    ) -> dict[str, jax.Array]:
+        drivers = zip(policies.values(), params, strict=True)
+        plans = [policy(own, scene, key).s for (policy, _), own in drivers]
 
         def of_plan(s: jax.Array) -> dict[str, jax.Array]:
             plan = trajectory_on_path(scene, s)
@@ -134,7 +136,8 @@ def gaps(
 
         return jax.vmap(of_plan)(jnp.stack(plans))
 
-    found = _one_by_one(lambda _, scene: measure(params, scene), scenes)  # [B, P]
+    own = [params for _, params in policies.values()]
+    found = _one_by_one(lambda _, scene: measure(weights, own, scene), scenes)  # [B, P]
     judged = np.all(found["admissible"], axis=1)
     if np.unique(case[judged]).size < 2:
         raise InputError(

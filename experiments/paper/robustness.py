@@ -13,8 +13,8 @@ frames on coarse lattices, two minutes.
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 from absl import flags
 
 from experiments.paper.plans import (
@@ -31,7 +31,6 @@ from rcirl_jax.export.loading import open_reward, reward_params
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.dp import FINE, DpConfig, dp_policy
 from rcirl_jax.planner.rank import (
-    Policy,
     RankConfig,
     hand_score,
     rank_policy,
@@ -97,12 +96,13 @@ def main() -> None:
     met, case = frames(rank, params, cases, duration, EVERY_S, count)
     dp = dp_policy(features, activation, config, coarse)
     finer = DpConfig(step=2.0) if quick else FINE
-    planners = {"rank": rank, "DP": dp}
-    optimality = gaps(planners, params, met, case, features, activation, finer)
+    planners = {"rank": (rank, params), "DP": (dp, (params, np.asarray(True)))}
+    optimality = gaps(
+        planners, reward_params(reward), met, case, features, activation, finer
+    )
     _shown(folder, "optimality", OPTIMALITY, optimality)
     noise = Disturbance(samples=8 if quick else 16)
-    rows: dict[str, tuple[Policy, Any]] = {"rank": (rank, params), "DP": (dp, params)}
-    rows["hand-set"] = (rank_policy(hand_score, config), None)
+    rows = {**planners, "hand-set": (rank_policy(hand_score, config), None)}
     robustness: Table = {}
     for name, (policy, weights) in rows.items():
         found = steadiness(policy, weights, met, noise)

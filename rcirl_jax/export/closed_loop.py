@@ -210,8 +210,7 @@ def table_rows(
         raise InputError("dp: without weights: expected a weights file")
     if dp and first is not None:
         prior_cost = first.prior_cost
-        made = functools.partial(
-            dp_policy,
+        policy = dp_policy(
             feature_map(preset),
             activation,
             config_of(first, first.mode),
@@ -220,10 +219,13 @@ def table_rows(
         )
         known = rows[0]
         rows[1:1] = [
-            dataclasses.replace(known, name=f"{known.name} search", policy=made()),
             dataclasses.replace(
-                known, name=f"{known.name} DP", policy=made(alone=True)
-            ),
+                known,
+                name=f"{known.name} {name}",
+                policy=policy,
+                params=(known.params, np.asarray(alone)),
+            )
+            for name, alone in (("search", False), ("DP", True))
         ]
     for name, place in planners:
         if is_place(place):

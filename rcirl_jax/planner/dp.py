@@ -754,9 +754,11 @@ def dp_policy(
     rank: RankConfig,
     config: DpConfig,
     own: str = "constant V",
-    alone: bool = False,
 ) -> Policy:
     """The planner by a `Ranking` to whose sampled candidates search adds its plans.
+
+    Its parameters are the ranking and `alone`: of the sampled candidates only emergency
+    stops may then be driven.
 
     Plans of the lattice and their smoothed twins are candidates like others: they pass
     the same safety filter, and the one of the highest score is driven. Where paths are
@@ -769,7 +771,6 @@ def dp_policy(
       rank: sampler and filter.
       config: lattice.
       own: the prior cost of the rankings that will drive, of TIME_SUMS.
-      alone: of the sampled candidates only emergency stops may be driven.
 
     Raises:
       InputError: the own cost is no sum over times.
@@ -782,12 +783,13 @@ def dp_policy(
     score = ranking_score(features, activation, rank.own)
 
     def replan(
-        params: Ranking, scene: Scene, key: jax.Array, in_force: PreviousPlan | None
+        searching: tuple[Ranking, jax.Array],
+        scene: Scene,
+        key: jax.Array,
+        in_force: PreviousPlan | None,
     ) -> Plan:
+        params, alone = searching
         sampled = sample(key, scene, rank.sampler)
-        if alone:
-            stops = sampled.family == family_index("emergency")
-            sampled = sampled.replace(feasible=sampled.feasible & stops)
         scores = score(params, scene, sampled)
         admissible = check(scene, sampled, rank.safety).admissible
         nearest = jnp.argmax(jnp.where(admissible, scores, -jnp.inf))
@@ -809,6 +811,8 @@ def dp_policy(
         may = may & jnp.tile(plans.feasible, 2)
         family = jnp.full(may.shape, family_index("cruise"))
         proposed = Candidates(trajectory=found, feasible=may, family=family)
+        stops = ~alone | (sampled.family == family_index("emergency"))
+        sampled = sampled.replace(feasible=sampled.feasible & stops)
         both = lambda *x: jnp.concatenate(x)  # noqa: E731
         candidates = jax.tree.map(both, sampled, proposed)
         candidates = with_plan_in_force(candidates, in_force)
