@@ -55,7 +55,7 @@ NO_EMITTERS = $(shell $(BIN)/python -c 'import jaxlib; print("--xla_cpu_use_fusi
   if int(jaxlib.__version__.split(".")[1]) < 11 else "")')
 TEST = $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "$(MARKS)"
 
-.PHONY: demo test test-all test-slow test-long test-dataset test-floor test-ceiling lint bench docs notebooks onboard
+.PHONY: demo test test-all test-slow test-long test-dataset test-floor test-ceiling lint bench results docs notebooks onboard
 .PHONY: setup
 .PHONY: lock audit wheel clean reliability fuzz accelerator
 
@@ -164,6 +164,11 @@ bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks.importing --data=$(RECORDINGS)
 	$(BIN)/python -m benchmarks.paper_scale
 	$(BIN)/python -m benchmarks.plots
+
+# The files that docs/results.md cites, from the datasets in out/, cheapest first; it says for how
+# many hours, and goes on where it was
+results: setup
+	$(BIN)/python -m benchmarks.remake
 
 # Everything that an accelerator is asked, in eight minutes, with the Python and JAX that are
 # there (`PYTHON=python3.12`): nothing is downloaded or built. `SMALL=--small` rehearses it on a CPU

@@ -19,11 +19,7 @@ ROWS = {  # of the closed-loop table: row of the files -> its name in the pages
     **{name: name for name in ("hand-set", "+velocity", "constant V")},
     **{name: name for name in ("random weights", "IDM", "IDM, tuned")},
 }
-SITES = {  # of docs/rankings.md: head, and its files
-    "US-101, 107 vehicles": ("us101_recording", "us101_recording_free"),
-    "urban, 45": ("urban", "urban_free"),
-    "I-80, 323": ("i80", "i80_free"),
-}
+SITES = {"US-101": "us101", "urban": "urban", "I-80": "i80"}  # of docs/rankings.md
 LEARNERS = (
     *("MaxEnt 32-16", "MaxEnt monotone 32-16", "logistic free"),
     *("logistic non-negative", "RC-IRL logistic", "GAN free", "RC-IRL rank"),
@@ -87,10 +83,10 @@ def closed_loop(path: Path) -> None:
 def rankings(path: Path) -> None:
     """Top-1 distance of some learners and baselines on three sites."""
     rows: dict[str, dict[str, tuple]] = {name: {} for name in LEARNERS}
-    for site, files in SITES.items():
-        both = [results(f"human_likeness_{name}")["rows"] for name in files]
+    for site, file in SITES.items():
+        table = results(f"human_likeness_{file}")["rows"]
         for name in LEARNERS:
-            found = next(table[name] for table in both if name in table)["top1_fde"]
+            found = table[name]["top1_fde"]
             rows[name][site] = tuple(found[k] for k in ("value", "low", "high"))
     interval_chart(path, {s: (s, "top-1, m") for s in SITES}, rows, 2.7)
 
@@ -124,8 +120,8 @@ def sweep(path: Path) -> None:
 
 
 def gamma(path: Path) -> None:
-    """Time weights of three losses, ten seeds, each over its mean."""
-    found = results("discount_factors_curves")
+    """Time weights of three losses, each over its mean."""
+    found = results("discount_factors")
     made, axes = figure(1, 1, 5.6, 3.2)
     curves = {}
     for name, row in found["rows"].items():
