@@ -1,7 +1,7 @@
 """Makes the files of benchmarks/results that docs/results.md cites, cheapest first.
 
     make results    # all, from out/us101, out/urban and out/i80
-    python -m benchmarks.remake --us101=DATA --urban=DATA --i80=DATA --commands=optimisers
+    python -m benchmarks.remake --us101=DATA --parts=optimisers,discount_factors
     python -m benchmarks.remake --check
 
 What today's code has made is left as it is, so a killed run goes on where it was. What
@@ -37,7 +37,7 @@ _RESULTS = flags.DEFINE_string("kept_in", str(RESULTS), "folder of the JSONs")
 _RECORDINGS = flags.DEFINE_string(
     "recordings", "../shared/data", "folder of the recordings, for the labels"
 )
-_ONLY = flags.DEFINE_list("commands", [], "commands by name; all if empty")
+_ONLY = flags.DEFINE_list("parts", [], "commands by name; all if empty")
 _CHECK = flags.DEFINE_bool("check", False, "only say what is missing or of other code")
 
 
@@ -211,7 +211,7 @@ def main() -> None:
     known = {command.name: command for command in COMMANDS}
     for name in _ONLY.value:
         if name not in known:
-            raise InputError(f"commands: {name}: unknown: expected {', '.join(known)}")
+            raise InputError(f"parts: {name}: unknown: expected {', '.join(known)}")
     asked = [known[name] for name in _ONLY.value or known]
     results = Path(_RESULTS.value)
     left = left_of(asked, results)
