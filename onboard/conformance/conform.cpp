@@ -36,7 +36,9 @@ int main(int count, char** arguments) {
   for (const float value : features) std::printf("%.9g\n", static_cast<double>(value));
   for (const float value : scores) std::printf("%.9g\n", static_cast<double>(value));
   std::vector<rcirl::Ruling> rulings(candidates.count);
-  rcirl::admit(one.scene, candidates, {}, rulings.data());
+  rcirl::SafetyLimits limits;
+  limits.entry = candidates.l != nullptr;
+  rcirl::admit(one.scene, candidates, limits, rulings.data());
   for (const rcirl::Ruling& ruling : rulings) {
     const bool named = ruling.obstacle != rcirl::Ruling::kNobody;
     const double time = std::isfinite(ruling.time) ? static_cast<double>(ruling.time) : -1.0;

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from rcirl_jax.export.own_planner.builder import plain_scene
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.safety import explain
+from rcirl_jax.planner.safety import SafetyConfig, explain
 from rcirl_jax.runtime.atomic_files import write_whole
 from rcirl_jax.types import Kind, Scene
 from rcirl_jax.units import NUM_STATIONS, TIMES_S
@@ -31,6 +31,8 @@ HEAD = "# Made by onboard/conformance/make.py; README.md says how it reads.\n"
 UNTIL = np.arange(TIMES_S.size) < 9  # a light's first half
 LINE = {"length": 0.1, "width": 40.0, "kind": Kind.STOP}
 LEAD = {"s": 30.0, "speed": 8.0}
+BEHIND = {"l": 3.6}  # in the lane on the left
+ENTERS_L = 3.6 * np.clip(TIMES_S / 4.0, 0.0, 1.0)  # m, of who goes there
 
 
 def hand_made() -> dict[str, Scene]:
@@ -79,6 +81,8 @@ def unsafe() -> dict[str, Scene]:
         "over_the_limit": scene(speed_limit=8.0),
         "sharp_bend": scene(v=20.0, kappa=0.03),
         "crossing": scene(boxes=[{"s": 40.0, "l": -1.2, "length": 0.6, "kind": 3}]),
+        "enters_too_near": scene(v=20.0, boxes=[{**BEHIND, "s": -14.0, "speed": 20.0}]),
+        "enters_with_room": scene(v=5.0, boxes=[{**BEHIND, "s": -38.0, "speed": 10.0}]),
     }
 
 
@@ -89,9 +93,13 @@ def narrow(made: Scene) -> Scene:
 
 
 def rulings(made: Scene, s: np.ndarray, l: np.ndarray | None) -> np.ndarray:
-    """Reason, obstacle and time [K, 3] in JAX; -1: no obstacle, no one time."""
+    """Reason, obstacle and time [K, 3] in JAX; -1: no obstacle, no one time.
+
+    With offsets the rule about lanes that are entered counts too.
+    """
     kept = [n for n, kind in enumerate(made.obstacles.kind) if is_there(made, n, kind)]
-    found = explain(made, own_planner.candidates(made, s, l))
+    config = SafetyConfig(entry=l is not None)
+    found = explain(made, own_planner.candidates(made, s, l), config)
     reason, obstacle, time = (np.asarray(x) for x in found)
     # places among the obstacles of the plain scene, which has no empty slots
     place = np.array([kept.index(n) if n >= 0 else -1 for n in obstacle.tolist()])
@@ -124,6 +132,8 @@ def main(folder: Path) -> None:
         s, l = drawn_scenes.candidates(np.random.default_rng(number), one, 2)
         s = np.concatenate([made.ego.v * TIMES_S[None, None], s], axis=1)
         l = None if number % 3 == 0 else np.concatenate([l[:, :1], l], axis=1)
+        if l is not None and name.startswith("enters"):
+            l[:, 0] = ENTERS_L
         features, values = (x[0] for x in jax_answers(columns, reward, one, s, l))
         ways = (s[0], None if l is None else l[0])
         text += [f"case {name}", f"weights {preset}.msgpack"]

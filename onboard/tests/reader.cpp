@@ -8,7 +8,8 @@
 //   reader features WEIGHTS CASES         -> for each case of CASES (tests/flat.hpp, float32)
 //                                            float32 features [K, T, F] and scores [K]
 //   reader admit CASES                    -> for each case float32 rulings [K, 3]: reason,
-//                                            obstacle and time, -1 if none
+//                                            obstacle and time, -1 if none; with offsets, those
+//                                            of lanes that are entered too
 //   reader choose GUARD WEIGHTS CASES [OWN]  -> for each case "best, K if none" and why, a line;
 //                                            then of each candidate its value and why not.
 //                                            OWN: float32 own values, case after case
@@ -121,7 +122,9 @@ int admit(const char* cases) {
     if (!take_case(source, &one)) return 2;
     const rcirl::Candidates candidates = one.candidates();
     std::vector<rcirl::Ruling> rulings(candidates.count);
-    rcirl::admit(one.scene, candidates, {}, rulings.data());
+    rcirl::SafetyLimits limits;
+    limits.entry = candidates.l != nullptr;
+    rcirl::admit(one.scene, candidates, limits, rulings.data());
     std::vector<float> found;
     for (const rcirl::Ruling& ruling : rulings) {
       const bool named = ruling.obstacle != rcirl::Ruling::kNobody;

@@ -176,8 +176,7 @@ def check(
         inside = xp.all(slow & on_road & gentle, axis=0)
         admissible = admissible & inside & xp.all(keeps, axis=0)
         if config.entry:
-            for crowded in _crowds(scene, x, config):
-                admissible = admissible & ~xp.any(crowded, axis=0)
+            admissible = admissible & ~xp.any(_crowds(scene, x, config), axis=(0, 1))
     return Verdict(
         admissible=admissible,
         contact_s=body,
@@ -226,7 +225,7 @@ def explain(
         nearest = xp.argmin(xp.where(keeps, xp.inf, margin), axis=0)
         rules.append((xp.any(~keeps, axis=0), nearest, None))
         if config.entry:
-            crowded = xp.stack(list(_crowds(scene, x, config)))  # [N, T - 1, K]
+            crowded = _crowds(scene, x, config)
             rules.append(_first_of(xp.where(crowded, TIMES_S[1:, None], xp.inf)))
     count = x.s.shape[1]
     reason = xp.zeros(count, "int32")
@@ -345,6 +344,13 @@ def _touches(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
     behind = (0.5 * (s_upper + s_lower) - x.s[first] < 0.0) & in_way  # [N, K]
     moves = (xp.abs(speed[:, 0]) > MOVING_MPS) & (obstacles.kind != Kind.STATIC)
     starts = TIMES_S[:-1, None]
+    entry, brakes = config.entry and config.track == "full", behind
+    if entry:  # [N, T - 1, K]: whom the ego has moved in ahead of
+        is_in, enters, ahead = _entries(scene, x, config)
+        drives = (obstacles.kind <= Kind.CYCLIST)[:, None]
+        follows = drives & xp.any(enters & ~ahead[:, 1:], axis=1)
+        follows = follows & ~xp.any(enters & ahead[:, 1:], axis=1)
+        brakes = is_in[:, :-1] & follows[:, None]
     for n in range(obstacles.kind.shape[0]):
         if xp is np and not known[n].any():  # XLA cannot see it, numpy can
             yield np.zeros(x.s[:-1].shape, bool)
@@ -363,13 +369,7 @@ def _touches(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
         near = (xp.abs(m_s) <= e_s + h_s) & (xp.abs(m_l) <= e_l + h_l)
         near = near & (0.5 * cross <= e_s * h_l + e_l * h_s)
         near = near & known[n] & ~behind[n]
-        if config.entry and config.track == "full":
-            is_in, enters, ahead = _entries(scene, x, config, n)
-            drives = obstacles.kind[n] <= Kind.CYCLIST
-            follows = drives & xp.any(enters & ~ahead[1:], axis=0)
-            follows = follows & ~xp.any(enters & ahead[1:], axis=0)
-            near = near & ~(is_in[:-1] & follows)
-        yield near
+        yield near & ~brakes[n] if entry else near
 
 
 def _crossings(scene: Scene, x: Motion, config: SafetyConfig) -> Array:
@@ -404,32 +404,35 @@ def _rss_distance(v: Array, lead: Array, config: SafetyConfig) -> Array:
     return xp.maximum(needed, 0.0) + config.standstill
 
 
-def _entries(
-    scene: Scene, x: Motion, config: SafetyConfig, n: int
-) -> tuple[Array, Array, Array]:
-    """The ego in the corridor of obstacle n, where it did not have to be.
+def _entries(scene: Scene, x: Motion, config: SafetyConfig) -> tuple[Array, ...]:
+    """The ego in corridors of bodies, where it did not have to be.
 
     The ego enters where its box comes beside or before one that it would be clear of at
     its offset of t = 0; whoever changes lane towards it is not its doing.
 
     Returns:
-      Whether it is in [T, K], enters [T - 1, K], and has the obstacle ahead [T, K].
+      Whether it is in [N, T, K], enters [N, T - 1, K], and has the body ahead
+      [N, T, K].
     """
-    obstacles = scene.obstacles
-    xp = namespace(x.s, obstacles.s_lower)
+    o = scene.obstacles
     reach = 0.5 * scene.ego.width + config.margin_across
-    body = (obstacles.kind[n] >= Kind.VEHICLE) & (obstacles.kind[n] <= Kind.STATIC)
-    low_s, high_s, low_l, high_l, valid = (
-        getattr(obstacles, name)[n][:, None]
-        for name in ("s_lower", "s_upper", "l_lower", "l_upper", "valid")
-    )
-    aside = lambda l: xp.maximum(low_l - l, l - high_l)  # noqa: E731
-    is_in = (aside(x.l) < reach) & (aside(x.l[:1]) >= reach) & valid & body
-    return is_in, is_in[1:] & ~is_in[:-1], 0.5 * (low_s + high_s) > x.s
+    body = (o.kind >= Kind.VEHICLE) & (o.kind <= Kind.STATIC)
+    there = (o.valid & body[:, None])[..., None]
+    near, clear = _beside(scene, x.l) < reach, _beside(scene, x.l[:1]) >= reach
+    is_in = near & clear & there
+    ahead = (0.5 * (o.s_lower + o.s_upper))[..., None] > x.s
+    return is_in, is_in[:, 1:] & ~is_in[:, :-1], ahead
 
 
-def _crowds(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
-    """For each obstacle, when [T - 1, K] the ego enters its corridor too near to it.
+def _beside(scene: Scene, l: Array) -> Array:
+    """How far [N, T, K] m obstacles are beside offsets l [T or 1, K]; < 0: in way."""
+    o = scene.obstacles
+    xp = namespace(l, o.l_lower)
+    return xp.maximum(o.l_lower[..., None] - l, l - o.l_upper[..., None])
+
+
+def _crowds(scene: Scene, x: Motion, config: SafetyConfig) -> Array:
+    """Finds [N, T - 1, K] the ego entering a body's corridor too near to it.
 
     Where it enters (`_entries`)
 
@@ -439,30 +442,25 @@ def _crowds(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
     It also comes too near where it ends up nearer than `room` behind what never moves,
     and nearer than now.
     """
-    obstacles, ego = scene.obstacles, scene.ego
-    xp = namespace(x.s, obstacles.s_lower)
-    reach = 0.5 * ego.width + config.margin_across
-    for n in range(obstacles.kind.shape[0]):
-        low_s, high_s, low_l, high_l, speed, valid = (
-            getattr(obstacles, name)[n][:, None]
-            for name in ("s_lower", "s_upper", "l_lower", "l_upper", "speed", "valid")
-        )
-        _, enters, ahead = _entries(scene, x, config, n)
-        before = low_s - x.s - 0.5 * ego.length
-        after = x.s - 0.5 * ego.length - high_s
-        brakes = xp.maximum(speed**2 - x.v**2, 0.0) / (2.0 * config.rear_braking)
-        behind = xp.maximum(speed, 0.0) * config.rear_reaction + brakes
-        near = xp.where(
-            ahead,
-            before < _rss_distance(x.v, speed, config),
-            after < xp.where(speed > 0.0, behind, 0.0) + config.standstill,
-        )
-        crowds = enters & near[1:]
-        in_way = xp.maximum(low_l - x.l, x.l - high_l) < reach
-        stuck = (obstacles.kind[n] == Kind.STATIC) & valid & valid[:1] & in_way & ahead
-        stuck = stuck & (before < config.room) & (before < before[:1] - NEARER_M)
-        last = xp.arange(1, x.s.shape[0])[:, None] == x.s.shape[0] - 1
-        yield crowds | (stuck[1:] & last)
+    o, half = scene.obstacles, 0.5 * scene.ego.length
+    xp = namespace(x.s, o.s_lower)
+    speed = o.speed[..., None]
+    _, enters, ahead = _entries(scene, x, config)
+    before = o.s_lower[..., None] - x.s - half
+    after = x.s - half - o.s_upper[..., None]
+    brakes = xp.maximum(speed**2 - x.v**2, 0.0) / (2.0 * config.rear_braking)
+    behind = xp.maximum(speed, 0.0) * config.rear_reaction + brakes
+    near = xp.where(
+        ahead,
+        before < _rss_distance(x.v, speed, config),
+        after < xp.where(speed > 0.0, behind, 0.0) + config.standstill,
+    )
+    reach = 0.5 * scene.ego.width + config.margin_across
+    stuck = ((o.kind == Kind.STATIC)[:, None] & o.valid & o.valid[:, :1])[..., None]
+    stuck = stuck & (_beside(scene, x.l) < reach) & ahead & (before < config.room)
+    stuck = stuck & (before < before[:, :1] - NEARER_M)
+    last = xp.arange(1, x.s.shape[0])[:, None] == x.s.shape[0] - 1
+    return (enters & near[:, 1:]) | (stuck[:, 1:] & last)
 
 
 def _rss(scene: Scene, x: Motion, config: SafetyConfig) -> tuple[Array, Array]:

@@ -22,12 +22,13 @@ def reader():
     return built("reader") / "reader"
 
 
-def moved(by):
+def moved(by, entry):
     """The filter's limits, stricter by so much."""
     usual = SafetyConfig()
     wider = ("margin_along", "margin_across", "line_margin", "standstill")
     lower = ("speed_slack", "max_lateral_acceleration")
     return SafetyConfig(
+        entry=entry,
         rss_recovery=usual.rss_recovery + by,
         **{name: getattr(usual, name) + by for name in wider},
         **{name: getattr(usual, name) - by for name in lower},
@@ -63,8 +64,8 @@ def in_cpp(reader, folder, cases):
 def test_rulings_on_random_scenes_are_those_of_jax(reader, tmp_path, on_path):
     scenes = drawn_scenes.scenes(np.random.default_rng(5), SCENES)
     s, l = drawn_scenes.candidates(np.random.default_rng(6), scenes, EACH)
-    told = []
-    for config in (SafetyConfig(), moved(-ROUNDING), moved(ROUNDING)):
+    told, usual = [], SafetyConfig(entry=not on_path)
+    for config in (usual, *(moved(x, not on_path) for x in (-ROUNDING, ROUNDING))):
         admissible, found = judge(config, on_path)(scenes, s, l)
         reason, obstacle, time = (np.asarray(x) for x in found)
         np.testing.assert_array_equal(reason == Reason.NONE, admissible)
@@ -73,15 +74,15 @@ def test_rulings_on_random_scenes_are_those_of_jax(reader, tmp_path, on_path):
     wanted, looser, stricter = told
     sure = (looser == stricter).all(axis=2)
     assert sure.mean() > 0.97
-    counts = np.bincount(wanted[..., 0].astype(int).ravel(), minlength=8)
-    never = {Reason.NOT_FEASIBLE, Reason.ENTRY}
-    never |= {Reason.ROAD} if on_path else set()
+    counts = np.bincount(wanted[..., 0].astype(int).ravel(), minlength=9)
+    never = {Reason.NOT_FEASIBLE}
+    never |= {Reason.ROAD, Reason.ENTRY} if on_path else set()
     assert all(counts[x] >= 5 for x in set(Reason) - never), counts
     cases = []
     for n in range(SCENES):
         plain = plain_scene(jax.tree.map(lambda x, n=n: x[n], scenes))
         cases.append((plain, s[n], None if on_path else l[n]))
-    in_numpy = np.stack([np.stack(admit(*case), axis=1) for case in cases])
+    in_numpy = np.stack([np.stack(admit(*x, safety=usual), axis=1) for x in cases])
     in_numpy = np.where(np.isfinite(in_numpy), in_numpy, -1.0)
     for rulings in (in_numpy, in_cpp(reader, tmp_path, cases)):
         np.testing.assert_allclose(rulings[sure], wanted[sure], rtol=1e-6)

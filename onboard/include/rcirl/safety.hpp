@@ -7,7 +7,8 @@
 //
 // The rules are those of `rcirl_jax/planner/safety.py`, with which the simulator and the gate
 // drive: swept boxes, lines that demand a stop, the speed limit, the road's edges, lateral
-// acceleration, and the distance to a leader (RSS). Nothing here knows what the vehicle can
+// acceleration, the distance to a leader (RSS) and, with `entry`, the gaps in a lane that is
+// entered. Nothing here knows what the vehicle can
 // drive: `Candidates::feasible` says that. Nothing but `text` allocates, throws or locks.
 #ifndef RCIRL_SAFETY_HPP_
 #define RCIRL_SAFETY_HPP_
@@ -42,6 +43,12 @@ struct SafetyLimits {
   float standstill = 1.0f;         // m kept at standstill behind a leader
   std::size_t rss_index = 2;       // of the time at which the distance is judged, below T
   float rss_recovery = 0.3f;       // m by which a violated distance must have grown by then
+  // Where paths are planned, as `SafetyConfig(entry=True)`: whether bodies that the ego itself
+  // moves in ahead of or behind keep a gap, and before what never moves there is room.
+  bool entry = false;
+  float rear_reaction = 0.6f;      // s, of who is behind then
+  float rear_braking = 3.0f;       // m/s^2
+  float room = 8.0f;               // m before what never moves, to get round it
 };
 
 // The rules, in the order in which a ruling names them.
@@ -54,6 +61,7 @@ enum class Reason : std::uint8_t {
   kRoad,         // a side of the box leaves the road
   kBend,         // lateral acceleration
   kDistance,     // too near behind a leader
+  kEntry,        // moves in too near ahead of a body or behind one
   // no rules of the filter, but of its input
   kNoNumber,     // a position that is not finite, or a scene that `check` refuses
   kNoRoad,       // offsets l, in a scene without the road's edges
@@ -86,6 +94,7 @@ inline std::string text(const Ruling& ruling) {
     case Reason::kRoad: return "leaves the road" + at;
     case Reason::kBend: return "has too much lateral acceleration" + at;
     case Reason::kDistance: return "is too near behind " + who;
+    case Reason::kEntry: return "moves in too near to " + who + at;
     case Reason::kNoNumber: return "has a number that is not finite, or its scene has";
     case Reason::kNoRoad: return "has offsets, and the scene no road edges";
   }
@@ -98,6 +107,7 @@ constexpr float kMovingMps = 1.0f;    // m/s, above which a body's prediction is
 constexpr float kCrossingMps = 1.0f;  // m/s, sideways speed above which a body is no leader
 constexpr float kFreeM = 1e3f;        // m, the margin to a leader where there is none
 constexpr float kRoundingM = 1e-2f;   // m, more than rounding errors are at a kilometre
+constexpr float kNearerM = 0.2f;      // m by which one comes nearer in earnest
 constexpr float kSameEdgeM = 0.01f;   // m by which a box may be further out than it is now
 constexpr float kNever = 1e9f;        // the key of a rule that is not broken
 
@@ -217,10 +227,87 @@ inline void meet_interval(const Middle& from, const Middle& to, std::size_t obst
   first->meet(keys, obstacle);
 }
 
+// Distance d to keep behind a leader (RSS) that stands after `braked` m:
+// d = v rho + v^2 / (2 b_ego) - v_lead^2 / (2 b_lead) + standstill
+inline float rss_distance(float v, float braked, const SafetyLimits& limits) {
+  const float needed = v * limits.reaction + v * v / (2.0f * limits.ego_braking) - braked;
+  return larger(needed, 0.0f) + limits.standstill;
+}
+
+inline float braked_by(float lead, const SafetyLimits& limits) {
+  return lead * lead / (2.0f * limits.leader_braking);
+}
+
+// Where the ego enters a body's corridor: its box comes beside or before one that it would be
+// clear of at its offset of t = 0. Flags are 1 or 0.
+struct Entries {
+  Lanes in[kTimes];       // it is in
+  Lanes behind, ahead;    // it has entered before the body, or behind it
+  Lanes crowds;           // the first time at which one of the two came too near; kNever
+};
+
+// How far a body is beside an offset; below 0: in its way.
+inline float beside(const Obstacle& box, std::size_t t, float l) {
+  return larger(box.l_lower[t] - l, l - box.l_upper[t]);
+}
+
+inline Entries entries(const Ego& ego, const Obstacle& box, const SafetyLimits& limits,
+                       const Point* x) {
+  Entries found;
+  const float reach = 0.5f * ego.width + limits.margin_across, half = 0.5f * ego.length;
+  for (std::size_t k = 0; k < kLanes; ++k) {
+    found.in[0].at[k] = found.behind.at[k] = found.ahead.at[k] = 0.0f;
+    found.crowds.at[k] = kNever;
+  }
+  for (std::size_t t = 1; t < kTimes; ++t) {
+    if (box.valid[t] == 0) {
+      std::fill(found.in[t].at, found.in[t].at + kLanes, 0.0f);
+      continue;
+    }
+    const float at = static_cast<float>(t), speed = box.speed[t];
+    const float lead = braked_by(larger(speed, 0.0f), limits);
+    for (std::size_t k = 0; k < kLanes; ++k) {
+      const float s = x[t].s.at[k], v = x[t].v.at[k];
+      const bool in = beside(box, t, x[t].l.at[k]) < reach && beside(box, t, x[0].l.at[k]) >= reach;
+      const bool enters = in && found.in[t - 1].at[k] == 0.0f;
+      const bool ahead = 0.5f * (box.s_lower[t] + box.s_upper[t]) > s;
+      found.in[t].at[k] = in ? 1.0f : 0.0f;
+      if (!enters) continue;
+      (ahead ? found.ahead : found.behind).at[k] = 1.0f;
+      const float brakes = larger(speed * speed - v * v, 0.0f) / (2.0f * limits.rear_braking);
+      const float needs = speed > 0.0f ? speed * limits.rear_reaction + brakes : 0.0f;
+      const bool near = ahead ? box.s_lower[t] - s - half < rss_distance(v, lead, limits)
+                              : s - half - box.s_upper[t] < needs + limits.standstill;
+      if (near && found.crowds.at[k] == kNever) found.crowds.at[k] = at;
+    }
+  }
+  return found;
+}
+
+// The gaps in corridors that the ego enters, and room before what never moves at the end.
+inline void meet_entry(const Ego& ego, const Obstacle& box, std::size_t obstacle,
+                       const SafetyLimits& limits, const Point* x, const Entries& entered,
+                       First* first) {
+  Lanes keys = entered.crowds;
+  const std::size_t end = kTimes - 1;
+  if (box.kind == ObstacleKind::kStatic && box.valid[0] != 0 && box.valid[end] != 0) {
+    const float reach = 0.5f * ego.width + limits.margin_across, half = 0.5f * ego.length;
+    const float middle_s = 0.5f * (box.s_lower[end] + box.s_upper[end]);
+    for (std::size_t k = 0; k < kLanes; ++k) {
+      const float now = box.s_lower[0] - x[0].s.at[k] - half;
+      const float before = box.s_lower[end] - x[end].s.at[k] - half;
+      const bool in_way = beside(box, end, x[end].l.at[k]) < reach && middle_s > x[end].s.at[k];
+      const bool stuck = in_way && before < limits.room && before < now - kNearerM;
+      if (stuck && keys.at[k] == kNever) keys.at[k] = static_cast<float>(end);
+    }
+  }
+  first->meet(keys, obstacle);
+}
+
 // All intervals of one body. One that comes from behind, in the ego's corridor when it is
-// first there, does not count.
+// first there, does not count; nor does a car or cyclist that the ego has moved in ahead of.
 inline void meet_body(const Obstacle& box, std::size_t obstacle, const SafetyLimits& limits,
-                      const Boxes& ego, const Point* x, First* first) {
+                      const Boxes& ego, const Point* x, const Entries* entered, First* first) {
   std::size_t begin = 0;
   while (begin < kTimes && box.valid[begin] == 0) ++begin;
   if (begin + 1 >= kTimes) return;
@@ -236,7 +323,14 @@ inline void meet_body(const Obstacle& box, std::size_t obstacle, const SafetyLim
     const bool known = box.valid[t] != 0 && box.valid[t + 1] != 0;
     const Middle to = box.valid[t + 1] != 0 ? middle(box, t + 1) : from;
     const float grown = moves ? limits.margin_growth * time_s(t) : 0.0f;
-    if (known) meet_interval(from, to, obstacle, t, grown, limits, ego, x, excused, first);
+    Lanes brakes = excused;
+    if (entered != nullptr && box.kind <= ObstacleKind::kCyclist) {
+      for (std::size_t k = 0; k < kLanes; ++k) {
+        const bool follows = entered->behind.at[k] > entered->ahead.at[k];
+        if (follows && entered->in[t].at[k] > 0.0f) brakes.at[k] = 1.0f;
+      }
+    }
+    if (known) meet_interval(from, to, obstacle, t, grown, limits, ego, x, brakes, first);
     from = to;
   }
 }
@@ -288,23 +382,19 @@ inline void meet_limits(const Ego& ego, const SafetyLimits& limits, const Point*
   }
 }
 
-// Margin [m] of a block to the RSS distance behind a body at time t:
-// d = v rho + v^2 / (2 b_ego) - v_lead^2 / (2 b_lead) + standstill
+// Margin [m] of a block to the RSS distance behind a body at time t.
 inline Lanes margin(const Ego& ego, const Obstacle& box, const SafetyLimits& limits,
                     const Point& x, std::size_t t) {
   Lanes found;
   std::fill(found.at, found.at + kLanes, kFreeM);
   if (box.valid[t] == 0) return found;
-  const float lead = larger(box.speed[t], 0.0f);
-  const float braked = lead * lead / (2.0f * limits.leader_braking);
+  const float braked = braked_by(larger(box.speed[t], 0.0f), limits);
   const float corridor = 0.5f * ego.width + limits.margin_across;
   for (std::size_t k = 0; k < kLanes; ++k) {
     const float v = x.v.at[k], s = x.s.at[k], l = x.l.at[k];
     const float gap = box.s_lower[t] - s - 0.5f * ego.length;
-    const float needed = v * limits.reaction + v * v / (2.0f * limits.ego_braking) - braked;
-    const float kept = gap - (larger(needed, 0.0f) + limits.standstill);
-    const float aside = larger(box.l_lower[t] - l, l - box.l_upper[t]);
-    const float in_way = aside < corridor ? kept : kFreeM;
+    const float kept = gap - rss_distance(v, braked, limits);
+    const float in_way = beside(box, t, l) < corridor ? kept : kFreeM;
     found.at[k] = box.s_upper[t] > s ? in_way : kFreeM;
   }
   return found;
@@ -332,10 +422,17 @@ inline void judge(const Scene& scene, const SafetyLimits& limits, std::size_t la
                   const Point* x, const bool* known, const std::uint8_t* feasible,
                   Ruling* rulings) noexcept {
   const Boxes ego(scene.ego, x);
-  First body, line, speed, road, bend, leader;
+  First body, line, speed, road, bend, leader, entry;
+  const bool enters = limits.entry && !limits.collisions_only;
   for (std::size_t n = 0; n < scene.obstacles.size(); ++n) {
     const Obstacle& box = scene.obstacles[n];
-    if (is_body(box)) meet_body(box, n, limits, ego, x, &body);
+    if (is_body(box) && enters) {
+      const Entries entered = entries(scene.ego, box, limits, x);
+      meet_body(box, n, limits, ego, x, &entered, &body);
+      meet_entry(scene.ego, box, n, limits, x, entered, &entry);
+    } else if (is_body(box)) {
+      meet_body(box, n, limits, ego, x, nullptr, &body);
+    }
     if (box.kind == ObstacleKind::kStop) meet_wall(scene.ego, box, n, limits, x, &line);
     if (is_body(box) && !limits.collisions_only) {
       meet_leader(scene.ego, box, n, limits, x, &leader);
@@ -362,7 +459,8 @@ inline void judge(const Scene& scene, const SafetyLimits& limits, std::size_t la
                       broken(Reason::kSpeed, speed, true, false) ||
                       broken(Reason::kRoad, road, true, false) ||
                       broken(Reason::kBend, bend, true, false) ||
-                      broken(Reason::kDistance, leader, false, true));
+                      broken(Reason::kDistance, leader, false, true) ||
+                      broken(Reason::kEntry, entry, true, true));
   }
 }
 

@@ -154,7 +154,8 @@ def pooled(parts: Sequence[Ranked]) -> Ranked:
         outcomes=dataclasses.replace(first, **several),
         group=join(*(np.asarray(part.group) for part in parts)),
         lanes=LaneOutcomes(
-            *(jax.tree.map(join, *(x[i] for x in lanes)) for i in range(2)),
+            jax.tree.map(join, *(x.candidates for x in lanes)),
+            jax.tree.map(join, *(x.human for x in lanes)),
             first.horizon_s,
         )
         if lanes

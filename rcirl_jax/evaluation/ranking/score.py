@@ -266,7 +266,7 @@ def score_scenes(
     values, human_values = made.pop("values"), made.pop("human_values")
     lanes = None
     if ways := made.pop("lanes", None):
-        lanes = LaneOutcomes(*ways, setup.horizon_s)
+        lanes = LaneOutcomes(ways[0], ways[1], setup.horizon_s)
     if setup.drop_collisions:
         made["feasible"] = made["feasible"] & ~made["crash"]
     outcomes = Outcomes(

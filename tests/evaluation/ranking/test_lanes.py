@@ -1,7 +1,5 @@
 """Which lane is chosen, and when its line is crossed, on scenes made by hand."""
 
-import types
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,6 +13,7 @@ from rcirl_jax.evaluation.ranking.lanes import (
 )
 from rcirl_jax.planner.mobil import MOBIL_ROW
 from rcirl_jax.units import TIMES_S
+from tests.helpers.scenes import scene
 
 HORIZON_S = 5.0
 # three humans: to the left after 2 s, to the right after 3 s, and one that stays
@@ -50,12 +49,10 @@ def test_what_is_not_feasible_is_not_chosen():
 
 
 def test_lines_are_crossed_between_the_times():
-    """Straight aside at 1 m/s from 0.25 m on, half a lane is 1.75 m."""
-    path = types.SimpleNamespace(
-        lane_left=jnp.array([1.75]), lane_right=-jnp.array([1.75])
-    )
+    """Straight aside at 1 m/s from 0.3 m on, half a lane is 1.8 m."""
+    path = scene().path
     l = jnp.stack(
-        [0.25 + TIMES_S, -0.25 - 0.5 * TIMES_S, 0.0 * TIMES_S, 2.0 + 0 * TIMES_S]
+        [0.3 + TIMES_S, -0.3 - 0.5 * TIMES_S, 0.0 * TIMES_S, 2.0 + 0 * TIMES_S]
     )
     found = lanes_of(l, l[:, 11], path, HORIZON_S)
     np.testing.assert_allclose(found.crossed_s, [1.5, 3.0, 5.0, 0.0], atol=1e-5)
@@ -64,10 +61,8 @@ def test_lines_are_crossed_between_the_times():
 
 def test_the_report_counts_each_group_of_scenes():
     """Four vehicles: two change lanes, two do not."""
-    twice = LaneOutcomes(
-        *(Lanes(*(np.concatenate([x, x[2:]]) for x in part)) for part in LANES[:2]),
-        HORIZON_S,
-    )
+    both = [Lanes(*(np.concatenate([x, x[2:]]) for x in part)) for part in LANES[:2]]
+    twice = LaneOutcomes(both[0], both[1], HORIZON_S)
     ways = {"good": [1, 3, 0, 0], MOBIL_ROW: [0, 3, 0, 1]}
     table = {}
     for name, which in ways.items():
