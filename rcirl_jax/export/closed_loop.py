@@ -113,9 +113,10 @@ from rcirl_jax.simulation.suite import (
     suite_refs,
 )
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.types import Candidates, Normaliser, RewardParams, Scene
+from rcirl_jax.types import Candidates, Scene
 
-NO_WEIGHTS = "paper21"  # features of "random weights" in a table without any
+# features and activation of "random weights" in a table without any
+NO_WEIGHTS, ACTIVATION = "paper21", RewardConfig().activation
 FIELDS = tuple(field.name for field in dataclasses.fields(Idm))
 _POSITIVE = Annotated[float, msgspec.Meta(gt=0.0, lt=1e6)]
 _IDM = msgspec.defstruct(
@@ -200,10 +201,19 @@ def table_rows(
             own = own_cost(places[0])
         return online(dataclasses.replace(sampler, mode=mode), track, own)
 
-    configs = [config_of(reward, reward.mode) for reward in rewards]
-    rows = _learned_rows(rewards, names, configs)
+    rows: list[Row] = []
+    for reward, name in zip(rewards, names or row_names(rewards), strict=True):
+        config = config_of(reward, reward.mode)
+        score, params = score_of(reward, config.own)
+        seed = int(reward.provenance.get("seed") or 0)
+        policy = rank_policy(score, config)
+        rows.append(Row(name=name, policy=policy, params=params, seed=seed))
     first = rewards[0] if rewards else None
-    preset, params, activation = _program_of(first)
+    # the program in which baselines are ranked
+    preset, params, activation = NO_WEIGHTS, drawn_weights(NO_WEIGHTS), ACTIVATION
+    if first is not None:
+        preset, activation = str(first.preset), first.activation
+        params = reward_params(first)
     config = config_of(first, mode or (first.mode if first else "speed"))
     in_speed = config_of(first, "speed")
     if dp and first is None:
@@ -251,29 +261,6 @@ def table_rows(
                 f"planner: {place.removeprefix(PREFIX)}: it is called {name}: expected "
                 "another name than other rows'"
             )
-    return rows
-
-
-def _program_of(
-    reward: Reward | None,
-) -> tuple[str, tuple[RewardParams, Normaliser], str]:
-    """Preset, weights and activation by whose program baselines are ranked."""
-    if reward is not None:
-        return str(reward.preset), reward_params(reward), reward.activation
-    return NO_WEIGHTS, drawn_weights(NO_WEIGHTS), RewardConfig().activation
-
-
-def _learned_rows(
-    rewards: Sequence[Reward], names: Sequence[str], configs: Sequence[RankConfig]
-) -> list[Row]:
-    """One row a file, under distinct names."""
-    rows: list[Row] = []
-    called = names or row_names(rewards)
-    for reward, name, config in zip(rewards, called, configs, strict=True):
-        seed = int(reward.provenance.get("seed") or 0)
-        score, params = score_of(reward, config.own)
-        policy = rank_policy(score, config)
-        rows.append(Row(name=name, policy=policy, params=params, seed=seed))
     return rows
 
 

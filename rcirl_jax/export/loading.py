@@ -25,7 +25,6 @@ from rcirl_jax.export.reader import (
 )
 from rcirl_jax.features.mapping import FeatureMap, feature_map
 from rcirl_jax.planner.own_cost import OwnCost, own_cost
-from rcirl_jax.reward import effective_model, value
 from rcirl_jax.reward.familiarity import Familiarity
 from rcirl_jax.reward.network import LEAKY_SLOPE, point_of
 from rcirl_jax.sampling import SamplerConfig
@@ -197,37 +196,6 @@ def own_sampler_of(rewards: Sequence[Reward], base: SamplerConfig) -> SamplerCon
         places = ", ".join(x.own for x in found.values())
         raise InputError(f"own sampler: {places}: expected one for all rows of a table")
     return next(iter(found.values()), base)
-
-
-def compiled_scorer(reward: Reward) -> Scorer:
-    """Return `reward.value` as a compiled program, one for all rewards of a shape.
-
-    Can be sent to other processes. For calls with up to 32,768 trajectories: see
-    BUILD.md on jaxlib's sums.
-    """
-    return functools.partial(_score, *reward_params(reward), reward.activation)
-
-
-def _score(
-    effective: RewardParams,
-    normaliser: Normaliser,
-    activation: str,
-    x: np.ndarray,
-    valid: np.ndarray,
-) -> np.ndarray:
-    return np.asarray(_value(effective, normaliser, x, valid, activation))
-
-
-@functools.partial(jax.jit, static_argnames="activation")
-def _value(
-    effective: RewardParams,
-    normaliser: Normaliser,
-    x: jax.Array,
-    valid: jax.Array,
-    activation: str,
-) -> jax.Array:
-    model = effective_model(effective, activation)
-    return value(model, effective, normaliser, x, jnp.broadcast_to(valid, x.shape[:-1]))
 
 
 def row_name(reward: Reward) -> str:

@@ -51,7 +51,7 @@ from rcirl_jax.evaluation.statistics import (
     paired_difference,
 )
 from rcirl_jax.export.from_run import verification_samples, write_weights
-from rcirl_jax.export.loading import compiled_scorer, open_reward
+from rcirl_jax.export.loading import open_reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import Normaliser, seen_range
 from rcirl_jax.runtime.atomic_files import read_json, write_json, write_whole
@@ -440,7 +440,7 @@ class _Run:
         vehicles = ClusterBootstrap(np.asarray(rows.vehicle))
         rewards = {
             point.name: [
-                compiled_scorer(open_reward(str(self.weights_file(member))))
+                open_reward(str(self.weights_file(member))).value
                 for member in self.config.members(point)
             ]
             for point in points

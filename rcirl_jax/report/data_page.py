@@ -5,6 +5,7 @@ are filtered by radio buttons and style sheets alone.
 """
 
 import base64
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import jax
 import numpy as np
 import tqdm
 
+from rcirl_jax.data.drawing import draw_site
 from rcirl_jax.data.plans import facts_of
 from rcirl_jax.data.quality import oddities
 from rcirl_jax.data.scenes.filters import REASONS
@@ -19,7 +21,6 @@ from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import MALFORMED, InputError, counted
 from rcirl_jax.report.pages import Table, facts_text, part, write_page
 from rcirl_jax.report.scene import describe_scene, draw_scene, spoken, tag_names
-from rcirl_jax.report.site import site_png
 from rcirl_jax.types import Tag
 
 TAG_NAMES = tuple(tag.name.lower() for tag in Tag)
@@ -122,20 +123,20 @@ def write_data_page(
 
 def _sites(dataset: Dataset) -> list[dict]:
     """Draw the plan of each site that the dataset has; with its facts and notes."""
+    found = []
     try:
-        return [
-            {
-                "name": plan["name"],
-                "data": base64.b64encode(site_png(plan)).decode(),
-                "words": facts_of(plan),
-                "notes": plan["notes"],
-            }
-            for plan in dataset.plans()
-        ]
+        for plan in dataset.plans():
+            drawn = io.BytesIO()
+            draw_site(plan).savefig(drawn, dpi=110, format="png")
+            data = base64.b64encode(drawn.getvalue()).decode()
+            words, notes = facts_of(plan), plan["notes"]
+            one = {"name": plan["name"], "data": data, "words": words, "notes": notes}
+            found.append(one)
     except MALFORMED as error:
         raise InputError(
             f"plans.json: {error}: expected plans of `rcirl import`"
         ) from error
+    return found
 
 
 def _scenes(folder: Path, dataset: Dataset, rows: Sequence[int]) -> list[dict]:

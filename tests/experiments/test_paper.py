@@ -106,6 +106,27 @@ def test_the_example_frame_says_why(dataset, tmp_path):
 
 
 @pytest.mark.slow
+def test_left_out_site(tmp_path):
+    body, _ = made("left_out_site", tmp_path, "--recipe=quick")
+    hashes = {site["data_hash"] for site in body["sites"].values()}
+    assert len(hashes) == len(body["sites"]) == 2
+    for site in body["sites"].values():
+        value = lambda row, of=site["rows"]: of[row]["top1_fde"]["value"]  # noqa: E731
+        elsewhere, everywhere = value("without the site"), value("all sites")
+        assert value("oracle") < elsewhere != everywhere
+        assert site["runs"]["without the site"] == site["runs"]["all sites"] == 2
+        (apart,) = [
+            one["difference"]["mean"]
+            for one in site["comparisons"]
+            if (one["row"], one["reference"]) == ("without the site", "all sites")
+            and one["metric"] == "top1_fde"
+        ]
+        assert apart == pytest.approx(elsewhere - everywhere, abs=1e-6)
+    assert len(body["made_by"]["weights_sha256"]) == 2 * 3
+    assert shared_flags(body) == {"seeds": 2, "horizon": 5.0, "recipe": "quick"}
+
+
+@pytest.mark.slow
 def test_table2(dataset, tmp_path):
     """From people to the table: every row over every family."""
     made("table2", tmp_path, f"--data={dataset}")

@@ -243,6 +243,8 @@ def test_a_gate_of_two_programs(in_cpp):
     assert (names, incumbent) == (["candidate", "incumbent", "IDM"], "incumbent")
     job, incumbent = gate_job(place, "hand-set", **settings)
     assert [row.name for row in job.rows()] == ["candidate", "hand-set", "IDM"]
+    job, _ = gate_job("not_made_yet.msgpack", place, **settings)  # as autotune asks
+    assert (job.weights, job.names) == (("not_made_yet.msgpack",), ("candidate",))
     assert checked_program(place).name == "IDM in C++"
     assert list(job.planner_facts()) == [in_cpp]
     with pytest.raises(InputError, match="No such file or directory"):
