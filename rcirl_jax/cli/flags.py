@@ -45,6 +45,7 @@ from rcirl_jax.tuning.recipes import (
 )
 
 OUTPUT = "folder of the run; a run that is in it goes on"
+PLANNER = "your own cost (FILE.py:FUNCTION or FILE.so) or the command of a planner"
 
 
 def _subject(heading: str) -> Callable:

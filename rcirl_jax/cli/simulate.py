@@ -57,8 +57,7 @@ _WEIGHTS = flags.DEFINE_list("weights", [], "weights files, with commas")
 _PLANNERS = flags.DEFINE_multi_string(
     "planner",
     [],
-    "your own cost (FILE.py:FUNCTION or FILE.so), or the command of a program that "
-    "plans; may be given several times",
+    f"{shared.PLANNER}; may be given several times",
 )
 _DATA = flags.DEFINE_list(
     "data", [], "datasets of --suite=recorded or heldout, with commas"

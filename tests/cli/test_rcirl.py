@@ -31,7 +31,7 @@ REQUIRED = {
     "rank": "weights, --data",
     "simulate": "output",
     "gate": "candidate, --output",
-    "replay": "weights, --case, --output",
+    "replay": "case, --output",
     "report": "run",
     "human-likeness": "data",
     "drive-elsewhere": "simulator, --weights, --output",
