@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 import types
 
 import numpy as np
@@ -12,6 +13,7 @@ from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.units import TIMES_S
 from tests.helpers.commands import succeeded
 from tests.helpers.weights_files import random_weights
+from tests.onboard.programs import ONBOARD
 
 STEPS = 200
 SPEED = 12.0  # m/s
@@ -71,16 +73,20 @@ def test_plan_starts_when_it_was_made(planned):
         assert plan_start(record, shot, step) == pytest.approx(made)
 
 
-def test_a_case_is_one_page_with_the_player(tmp_path):
+@pytest.mark.parametrize("row", ["IDM", "IDM in Python"])
+def test_a_case_is_one_page_with_the_player(row, tmp_path):
     weights = random_weights(tmp_path / "w.msgpack")
-    case = ("--case=stopped_lead/000@0", "--row=IDM", "--duration=2")
-    flags = (f"--weights={weights}", *case, f"--output={tmp_path / 'out'}")
-    done = succeeded("rcirl_jax", "replay", *flags)
+    who = [f"--weights={weights}", "--row=IDM"]
+    if row != "IDM":
+        program = ONBOARD / "example" / "planner_program.py"
+        who = [f"--planner={sys.executable} {program}"]
+    case = ("--case=stopped_lead/000@0", "--duration=2")
+    done = succeeded("rcirl_jax", "replay", *who, *case, f"--output={tmp_path / 'out'}")
     (page,) = (tmp_path / "out").iterdir()
     block = r'<script type="application/json" id="replays">(.*?)</script>'
     (data,) = re.findall(block, page.read_text())
     (found,) = json.loads(data)["cases"]
     (driven,) = found["drives"]
-    assert (found["case"], driven["row"]) == ("stopped_lead/000@0", "IDM")
+    assert (found["case"], driven["row"]) == ("stopped_lead/000@0", row)
     assert len(driven["s"]) == 10  # 2 s at 5 Hz
     assert driven["summary"] in done.stdout
