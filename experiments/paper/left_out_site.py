@@ -150,7 +150,15 @@ def main() -> None:
         data = few(open_dataset(path))
         report = evaluate_ranking(data, learned, ranked, references=against)
         reports[site] = {**to_json(report), "data_hash": data.hash}
-        print(f"test vehicles of {site}:\n{format_table(report, 118)}")
+        said = format_table(report, 118, differences=False)
+        print(f"test vehicles of {site}:\n{said}")
+        for one in report.comparisons:
+            if one.metric == "top1_fde" and one.row in learned:
+                apart = one.difference
+                print(
+                    f"{one.row} minus {one.reference}, top-1 FDE: {apart.mean:+.2f} m "
+                    f"[{apart.low:+.2f}, {apart.high:+.2f}], {one.verdict}"
+                )
         shown = [ELSEWHERE, EVERYWHERE, own, *ranked.tuned, "random", "oracle"]
         rows = {name: report.rows[name]["top1_fde"] for name in shown}
         interval_panel(axis, {n: (x.value, x.low, x.high) for n, x in rows.items()})
