@@ -10,7 +10,13 @@ from collections.abc import Iterator, Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.evaluation.gate.types import AT_HIGHEST, CANDIDATE, Check, Pair
+from rcirl_jax.evaluation.gate.types import (
+    AT_HIGHEST,
+    CANDIDATE,
+    INCUMBENT,
+    Check,
+    Pair,
+)
 from rcirl_jax.evaluation.gate.words import WORDS, family_of, name_of
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
@@ -72,8 +78,8 @@ def _nearer_driver(pair: Pair) -> Iterator[str]:
     name, d = max(behind.items(), key=lambda item: item[1].mean)
     says = "farther from" if d.low > 0.0 else "not shown to be nearer to"
     yield (
-        f"On held-out recordings it is {says} people than {name}: its distance minus "
-        f"that one's {_numbers(d, 1.0, 2)} m"
+        f"On held-out recordings it is {says} people than {name_of(pair, name)}: its "
+        f"distance minus that one's {_numbers(d, 1.0, 2)} m"
     )
 
 
@@ -90,7 +96,8 @@ def _higher_score(pair: Pair) -> Iterator[str]:
     if scores[best].mean() <= scores[pair.mine].mean() or np.unique(clusters).size < 2:
         return
     d = over_clusters(scores[best], scores[pair.mine], ClusterBootstrap(clusters))
-    yield f"{best} has more of nuPlan's points: by {_numbers(d, 100.0, 1)}"
+    who = "The incumbent" if best == INCUMBENT else best
+    yield f"{who} has more of nuPlan's points: by {_numbers(d, 100.0, 1)}"
 
 
 def _not_excluded(checks: Sequence[Check], cases: int) -> Iterator[str]:

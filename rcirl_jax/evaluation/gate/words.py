@@ -148,9 +148,10 @@ def family_of(check: Check) -> str:
     return check.name.rpartition(", ")[0] if check.kind == "families" else ""
 
 
-def name_of(pair: Pair) -> str:
-    """Returns the incumbent's name in a sentence."""
-    return "the incumbent" if pair.name == INCUMBENT else pair.name
+def name_of(pair: Pair, row: str = "") -> str:
+    """Returns the name in a sentence of a row, by default the incumbent's."""
+    row = row or pair.name
+    return "the incumbent" if row == INCUMBENT else row
 
 
 def sentence(pair: Pair, verdict: Verdict) -> str:
