@@ -17,7 +17,7 @@ from rcirl_jax.export.own_planner import features
 from rcirl_jax.export.own_planner.builder import plain_scene
 from rcirl_jax.export.own_planner.choose import admit
 from rcirl_jax.features import columns as f
-from rcirl_jax.planner.safety import Reason
+from rcirl_jax.planner.safety import Reason, SafetyConfig
 from rcirl_jax.units import NUM_TIMES
 from tests.helpers.own_planner import TOLERANCE, entries, error, numpy_answers
 from tests.onboard.programs import ONBOARD
@@ -73,7 +73,9 @@ def test_the_answers_are_those_of_the_numpy_file(cases):
 
 def test_the_rulings_are_those_of_the_numpy_file(cases):
     for name, made in scenes().items():
-        reason, obstacle, time = admit(plain_scene(made), *positions(cases[name]))
+        s, l = positions(cases[name])
+        safety = SafetyConfig(entry=l is not None)
+        reason, obstacle, time = admit(plain_scene(made), s, l, safety=safety)
         time = np.where(np.isfinite(time), time, -1.0)
         found = np.stack([reason, obstacle, time], axis=1).ravel()
         np.testing.assert_allclose(found, cases[name].rulings, rtol=1e-6, err_msg=name)
@@ -81,7 +83,7 @@ def test_the_rulings_are_those_of_the_numpy_file(cases):
 
 def test_every_rule_is_broken_in_some_case(cases):
     found = {int(x) for case in cases.values() for x in case.rulings[::3]}
-    assert found == set(Reason) - {Reason.NOT_FEASIBLE, Reason.ENTRY}
+    assert found == set(Reason) - {Reason.NOT_FEASIBLE}
 
 
 def test_the_filter_is_compared_if_asked_for(cases, tmp_path):
