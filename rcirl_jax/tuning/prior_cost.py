@@ -34,6 +34,7 @@ from rcirl_jax.planner.rank import ONLINE, Score, hand_score, online, own_score
 from rcirl_jax.reward.familiarity import (
     UNITS,
     Familiarity,
+    familiar_nowhere,
     familiarity_logit,
     of_the_scene,
 )
@@ -78,23 +79,27 @@ def fitted_prior_cost(
       config: gains.
       recorded: the sources.
       shares: > 0, how much each of them counts.
-      elsewhere: simulated demonstrations.
+      elsewhere: simulated demonstrations; needed where the gain varies.
       features: of the reward.
       own: the user's own cost; None: the hand-set one.
       sampler: of the planner.
     """
-    mine = [_training_scenes(one, features, sampler) for one in recorded]
-    pairs = zip(mine, shares, strict=True)
-    weights = np.concatenate([np.full(len(x), share / len(x)) for x, share in pairs])
-    others = [
-        _training_scenes(one, features, sampler, config.slowed) for one in elsewhere
-    ]
-    made = fit_familiarity(
-        np.concatenate(mine),
-        weights,
-        np.concatenate(others),
-        np.asarray(of_the_scene(features)),
-    )
+    made = familiar_nowhere(features.num_features)
+    if config.low < config.high:
+        mine = [_training_scenes(one, features, sampler) for one in recorded]
+        weights = [
+            np.full(len(x), share / len(x))
+            for x, share in zip(mine, shares, strict=True)
+        ]
+        others = [
+            _training_scenes(one, features, sampler, config.slowed) for one in elsewhere
+        ]
+        made = fit_familiarity(
+            np.concatenate(mine),
+            np.concatenate(weights),
+            np.concatenate(others),
+            np.asarray(of_the_scene(features)),
+        )
     arrays = {name: np.asarray(getattr(made, name)) for name in ARRAYS}
     arrays["offset"] = arrays["offset"].reshape(1)
     name, unit = OWN_COST, 1.0

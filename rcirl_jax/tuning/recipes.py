@@ -97,8 +97,10 @@ class SimulatedDemonstrations:
 class PriorCostConfig:
     """[prior_cost] of a recipe; gains of V on top of the own cost."""
 
-    low: float = 0.0  # where nothing like the scene was recorded
-    high: float = 0.0  # where all of it was; 0: no prior cost, V drives alone
+    # where nothing like the scene was recorded, and where all of it was: one number
+    # twice is the gain everywhere; 0: no prior cost, V drives alone
+    low: float = 0.0
+    high: float = 0.0
     # shares of the ego's speed at which the simulated scenes are shown once more: who
     # is slow on an empty road is not in recorded traffic for being slow
     slowed: tuple[float, ...] = ()
@@ -194,10 +196,10 @@ def load_recipe(name: str) -> Recipe:
     seeds = tuned.get("seeds", 1)
     if type(seeds) is not int or seeds < 1:
         raise InputError(f"{path}: [autotune] seeds: {seeds}: expected at least 1")
-    if prior_cost.wanted and not simulated.datasets:
+    if prior_cost.low < prior_cost.high and not simulated.datasets:
         raise InputError(
-            f"{path}: [{SIMULATED}] expert: none: expected one with a [prior_cost]: "
-            "its drives show what was not recorded"
+            f"{path}: [{SIMULATED}] expert: none: expected one where the gain of "
+            "[prior_cost] varies: its drives show what was not recorded"
         )
     if trained.residual_on:
         where = f"{path}: [train] residual_on: {trained.residual_on}"
