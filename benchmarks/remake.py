@@ -109,6 +109,13 @@ COMMANDS = (
         {"discount_factors": "discount_factors.json"},
     ),
     Command(
+        "left_out_site",
+        40,
+        "experiments.paper.left_out_site --output={out} "
+        "--sites=us101={us101},urban={urban},i80={i80}",
+        {"left_out_site": "left_out_site.json"},
+    ),
+    Command(
         "leaky_rate_and_hidden_size",
         40,
         "rcirl_jax sweep --data={us101} --output={out} --recipe=paper "

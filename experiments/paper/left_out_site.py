@@ -49,6 +49,7 @@ from rcirl_jax.planner.baselines import TUNED_IDM_ROW
 from rcirl_jax.report.charts import interval_panel
 from rcirl_jax.report.style import figure, label, save
 from rcirl_jax.runtime.executors import Serial
+from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import Running
 from rcirl_jax.train.parallel import share_cores
 from rcirl_jax.tuning.loop import tune
@@ -123,7 +124,9 @@ def main() -> None:
     """Tune on all and on all but each, rank each, draw one panel per site."""
     found = sites()
     share_cores(recipe().train.batch_size)
-    setup = RankingSetup(horizon_s=HORIZON.value)
+    trained = recipe().train.sampler
+    sampler = trained.on_own(SamplerConfig(mode=trained.mode))  # the usual grid
+    setup = RankingSetup(horizon_s=HORIZON.value, sampler=sampler)
     everywhere = tuned(EVERYWHERE, [*found.values()])
     usual = tune_idm(open_datasets([*found.values()]), setup, IDM_EVALUATIONS)
     made, axes = figure(1, len(found), 5.5 * len(found), 4.0)
@@ -141,7 +144,6 @@ def main() -> None:
         ranked = dataclasses.replace(
             setup,
             preset=everywhere.config.train.features,
-            sampler=everywhere.config.train.sampler,
             tuned={f"{TUNED_IDM_ROW}, {row}": [x] for row, x in drivers.items()},
             own=everywhere.own_cost,
         )
