@@ -46,10 +46,6 @@ _PARALLEL = flags.DEFINE_enum(
 _IN_MEMORY = flags.DEFINE_float(
     "in_memory_mb", 1024.0, "MiB up to which the split is loaded whole, else streamed"
 )
-_VERIFY = flags.DEFINE_bool(
-    "verify", True, "read every byte of the data against its checksum first"
-)
-_PREFETCH = flags.DEFINE_integer("prefetch", 4, "batches read ahead")
 _SAVE = flags.DEFINE_integer(
     "checkpoint_every", 0, "steps, besides the end of each epoch; 0: none"
 )
@@ -69,12 +65,11 @@ def main() -> None:
     if _PARALLEL.value == "auto" and _PROCESSES.value is None:
         share_cores(config.batch_size)
     checked_sampler(config.sampler)
-    dataset = open_datasets(_DATA.value, _VERIFY.value, _TRAINING.data_weights)
+    dataset = open_datasets(_DATA.value, weights=_TRAINING.data_weights)
     dataset = with_tags(dataset, _TAGS.value)
     running = Running(
         parallel=_PARALLEL.value,
         in_memory_mb=_IN_MEMORY.value,
-        prefetch=_PREFETCH.value,
         checkpoint_every=_SAVE.value,
         trackers=_TRACKERS(),
     )

@@ -46,6 +46,8 @@ from rcirl_jax.train.parallel import (
 from rcirl_jax.train.state import TrainConfig, TrainState
 from rcirl_jax.train.step import init_state, make_train_step
 
+AHEAD = 4  # batches read ahead of the step
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Running:
@@ -55,8 +57,6 @@ class Running:
     parallel: str = "jit"
     # MiB of scenes up to which the training split is loaded whole
     in_memory_mb: float = 1024.0
-    # batches read ahead of the step
-    prefetch: int = 4
     # steps between checkpoints, besides those at the end of each epoch (0: none)
     checkpoint_every: int = 0
     # of `rcirl_jax.train.trackers`; None: TensorBoard if it is installed
@@ -66,11 +66,9 @@ class Running:
 
     def __post_init__(self) -> None:
         """Reject values out of range with the flag's name."""
-        least = {"in_memory_mb": 0, "prefetch": 1, "checkpoint_every": 0}
-        for name, low in least.items():
-            value = getattr(self, name)
-            if not value >= low:
-                raise InputError(f"{name}: {value}: expected >= {low}")
+        for name in ("in_memory_mb", "checkpoint_every"):
+            if not (value := getattr(self, name)) >= 0:
+                raise InputError(f"{name}: {value}: expected >= 0")
 
 
 def check_run(workdir: Path, config: TrainConfig, dataset: Demonstrations) -> None:
@@ -227,7 +225,7 @@ def _train(
             RunLog(workdir, config, step, total, running.trackers, shown=is_first())
         ) as log,
         contextlib.closing(checkpoints),
-        Prefetch(produce, running.prefetch) as ahead,
+        Prefetch(produce, AHEAD) as ahead,
     ):
         for epoch in range(step // per_epoch, config.epochs):
             sums = np.zeros(4)
