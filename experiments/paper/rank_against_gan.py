@@ -11,12 +11,10 @@ drives catalogue cases and ranks the held-out scenes of every source, in two for
     alone      V
     anchored   V_own + gain V,   gain = g spread(V_own) / spread(V)
 
-g goes from --low_share to --high_share with the familiarity, of recordings against
-drives of the own cost as the recipe `tuned` simulates them. Losses leave V on scales of
-their own, so g counts in spreads of the own cost: spread(V) is the standard deviation
-of V over the feasible candidates of a scene as the planner sees it, averaged over
-training scenes, as many of every source. With the defaults of g the listwise loss has
-about the gains of `tuned`, 0.2 and 2.
+g is --share. Losses leave V on scales of their own, so g counts in spreads of the own
+cost: spread(V) is the standard deviation of V over the feasible candidates of a scene
+as the planner sees it, averaged over training scenes, as many of every source. With the
+default of g the listwise loss has about the gain of `tuned`.
 
 Differences are paired by case, or scene; their intervals resample families, or
 vehicles, and seeds together. "smooth" is |jerk| below 6 m/s^3 throughout, "at fault"
@@ -30,7 +28,6 @@ import datetime
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -55,9 +52,8 @@ from experiments.paper.common import (
     write,
 )
 from experiments.paper.step_sizes import with_chosen_rates
-from rcirl_jax.cli.running import made_by_file, provenance, run
+from rcirl_jax.cli.running import provenance, run
 from rcirl_jax.data.store.dataset import (
-    Dataset,
     Demonstrations,
     JoinedDatasets,
     open_datasets,
@@ -92,16 +88,13 @@ from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
 from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.tuning.demonstrations import drive_round
 from rcirl_jax.tuning.prior_cost import OWN_COST, PriorCostConfig, fitted_prior_cost
-from rcirl_jax.tuning.recipes import DEFAULT, load_recipe
 from rcirl_jax.types import Scene
 
 _LOSSES = flags.DEFINE_list(
     "losses", None, "default: rank, gan, and listwise unless the recipe's own is rank"
 )
-_LOW = flags.DEFINE_float("low_share", 0.0035, "g where nothing was recorded", 0.0)
-_HIGH = flags.DEFINE_float("high_share", 0.035, "g where all was", 0.0)
+_SHARE = flags.DEFINE_float("share", 0.019, "g, above 0", 0.0)
 _CASES = flags.DEFINE_integer("cases", 12, "of each family", lower_bound=1)
 _DURATION = flags.DEFINE_float("duration", FULL_S, "s of a case", 1.0)
 _SEED = flags.DEFINE_integer("catalogue_seed", 0, "of the cases", lower_bound=0)
@@ -111,7 +104,6 @@ FORMS = ("alone", "anchored")
 BASELINES = (OWN_COST, "IDM", *TRIVIAL_BASELINES)
 RANKED_BASELINES = (OWN_COST, "IDM")
 SPREAD_SCENES = 256  # of each source
-QUICK_DRIVE_S = 12.0  # s of a drive; its scenes need 8 s of future
 
 
 def configs() -> dict[str, TrainConfig]:
@@ -164,23 +156,10 @@ def trained(
     return found, seen_range(fitting_rows(frozen, shared), features)
 
 
-def fitted(shares: PriorCostConfig, sources: Sequence[Demonstrations]) -> PriorCost:
-    """The prior cost with g for gains, against drives of the own cost."""
-    plan = load_recipe(DEFAULT).simulated
-    if QUICK.value:
-        plan = dataclasses.replace(plan, cases=1, duration_s=QUICK_DRIVE_S)
-    drives = drive_round(
-        0,
-        plan,
-        Path(OUTPUT.value) / "demonstrations",
-        config=recipe().train,
-        incumbent=OWN_COST,
-        learner=None,
-        before_commit=made_by_file(),
-    )
-    recorded = cast("Sequence[Dataset]", sources)  # only their scenes are asked for
-    features = feature_map(recipe().train.features)
-    return fitted_prior_cost(shares, recorded, [1.0] * len(sources), [drives], features)
+def fitted() -> PriorCost:
+    """The prior cost with g for its gain."""
+    gain = PriorCostConfig(low=_SHARE.value, high=_SHARE.value)
+    return fitted_prior_cost(gain, [], [], [], feature_map(recipe().train.features))
 
 
 def some_scenes(sources: Sequence[Demonstrations]) -> tuple[Scene, np.ndarray]:
@@ -332,13 +311,11 @@ def print_table(columns: Mapping[str, Column]) -> None:
 
 def main() -> None:
     """Train, drive, rank, compare, draw."""
-    gains = {"low": _LOW.value, "high": _HIGH.value}
-    shares = dataclasses.replace(load_recipe(DEFAULT).prior_cost, **gains)
     learners, (data, sources) = configs(), opened()
     learners, how = with_chosen_rates(data, learners)
     learned, seen = trained(data, learners)
     each = [*sources.values()]
-    files, spreads = written(learned, fitted(shares, each), data, each, seen)
+    files, spreads = written(learned, fitted(), data, each, seen)
     errors = {f"top-1 {site}, m": ranked(one, files) for site, one in sources.items()}
     cases, duration = (1, QUICK_S) if QUICK.value else (_CASES.value, _DURATION.value)
     columns = {**driven(files, cases, duration), **errors}

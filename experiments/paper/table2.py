@@ -12,7 +12,6 @@ all of it the suite, a quarter of an hour a row. `--quick`: three minutes, numbe
 without meaning.
 """
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -36,30 +35,21 @@ from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.report.charts import suite_chart
 from rcirl_jax.simulation.rows import BASELINES, Row
 from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
-from rcirl_jax.tuning.recipes import DEFAULT, load_recipe
 
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files instead of training")
 _DP_CASES = flags.DEFINE_integer("dp_cases", 2, "cases per family of the DP rows", 1)
 undefine_flags("cases", "duration", "catalogue_seed", "horizon")
 fixed(seeds=2)
-TRAINING = (
-    *("data", "recipe", "losses", "low_share", "high_share"),
-    *("seeds", "epochs", "positive"),
-)
+TRAINING = (*("data", "recipe", "losses", "share", "seeds", "epochs", "positive"),)
 
 
 def trained() -> dict[str, str]:
     """Weights files by row: of the first seed of every loss and form."""
-    gains = {
-        "low": flags.FLAGS["low_share"].value,
-        "high": flags.FLAGS["high_share"].value,
-    }
-    shares = dataclasses.replace(load_recipe(DEFAULT).prior_cost, **gains)
     data, sources = rank_against_gan.opened()
     learners, _ = with_chosen_rates(data, rank_against_gan.configs())
     learned, seen = rank_against_gan.trained(data, learners)
     each = [*sources.values()]
-    prior_cost = rank_against_gan.fitted(shares, each)
+    prior_cost = rank_against_gan.fitted()
     files, _ = rank_against_gan.written(learned, prior_cost, data, each, seen)
     first = f" {seeds()[0]}"
     names = [name for name in files if name.endswith(first)]

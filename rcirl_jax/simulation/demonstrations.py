@@ -8,11 +8,6 @@ dataset like any import: scenes as the planner sees them online (predicted, not
 recorded futures) with what the driver did in the following 8 s.
 
 It is a stand-in for human logs and says so in its manifest's source.
-
-With a learner the two take turns, as in a test car with a safety driver: the
-learner drives 25 s, the driver takes over for 13 s, and only scenes whose whole
-future was driven by the driver are kept. They show what to do where the
-learner's own mistakes lead (Ross et al. 2011, "DAgger", on takeovers).
 """
 
 import dataclasses
@@ -72,8 +67,6 @@ class DriveConfig:
     stride_s: float = 3.0
     test_fraction: float = 0.2
     split_seed: int = 0
-    # s that the learner, then the driver drive in turn (with a learner only)
-    turns_s: tuple[float, float] = (25.0, 13.0)
     # of every so many cases one ends at a destination on the way (0: none)
     destination_every: int = 4
     # m, where: drawn evenly between the two
@@ -81,7 +74,7 @@ class DriveConfig:
 
 
 def _rows(
-    record: Record, scenes: Scene, config: DriveConfig, takeovers: bool
+    record: Record, scenes: Scene, config: DriveConfig
 ) -> Iterator[dict[str, np.ndarray | float | int]]:
     """Flat rows of one clean drive, every `stride_s`, with 8 s of future."""
     valid = np.asarray(record.valid)
@@ -91,16 +84,10 @@ def _rows(
     clock = np.arange(1, steps + 1) * STEP_S
     s, l = np.asarray(record.s)[:steps], np.asarray(record.l)[:steps]
     stride = round(config.stride_s / FRAME_S)
-    learner_s, driver_s = config.turns_s if takeovers else (0.0, clock[-1])
-    for frame in range(1 if takeovers else stride, scenes.ego.v.shape[0]):
+    for frame in range(stride, scenes.ego.v.shape[0], stride):
         now = frame * FRAME_S
         if now + HORIZON_S > clock[-1]:
             return
-        driven = now % (learner_s + driver_s) - learner_s
-        if driven < 0.0 or driven + HORIZON_S > driver_s:
-            continue
-        if round(driven / FRAME_S) % stride:
-            continue
         origin = np.interp(now, clock, s)
         row = _flat(jax.tree.map(lambda x, at=frame: np.asarray(x[at]), scenes))
         # 0 along given paths, else the middle of the lane that offsets are from
@@ -142,7 +129,6 @@ def drive_catalogue(
     config: DriveConfig,
     *,
     expert: tuple[Policy, Params] | None = None,
-    learner: tuple[Policy, Params] | None = None,
     overwrite: bool = False,
     before_commit: Callable[[Dataset], object] = lambda dataset: None,
 ) -> Manifest:
@@ -157,7 +143,6 @@ def drive_catalogue(
       config: duration, stride, split.
       expert: who shows how to drive, with its weights; None: the driver models of
         `DRIVERS` in turn.
-      learner: a policy and its weights, with which the expert takes turns.
       overwrite: replace a finished dataset.
       before_commit: as `DatasetWriter.finish`.
 
@@ -169,7 +154,7 @@ def drive_catalogue(
         if writer.committed():  # of a killed run: drives are not taken up halfway
             writer = DatasetWriter(str(output), overwrite=True)
         try:
-            return _drive_all(refs, writer, config, (expert, learner), before_commit)
+            return _drive_all(refs, writer, config, expert, before_commit)
         except InputError:
             writer.abort()
             raise
@@ -179,15 +164,10 @@ def _drive_all(
     refs: Sequence[CaseRef],
     writer: DatasetWriter,
     config: DriveConfig,
-    who: tuple[tuple[Policy, Params] | None, tuple[Policy, Params] | None],
+    expert: tuple[Policy, Params] | None,
     before_commit: Callable[[Dataset], object],
 ) -> Manifest:
-    learner_s, driver_s = config.turns_s
-    rollout = RolloutConfig(
-        steps=round(config.duration_s / STEP_S),
-        frames_every=SPAN,
-        takeover_schedule=(round(learner_s / STEP_S), round(driver_s / STEP_S)),
-    )
+    rollout = RolloutConfig(steps=round(config.duration_s / STEP_S), frames_every=SPAN)
     quality, pending, lineage = QualityReport(), [], []
     names: list[str] = []
     sizes: dict[str, int] = {}
@@ -197,7 +177,7 @@ def _drive_all(
             part = refs[first : first + CHUNK]
             driver = DRIVERS[first // CHUNK % len(DRIVERS)]
             model = rule_policy, rule("IDM yielding", driver)
-            driven = _drives(part, first, who[0] or model, who[1], rollout, config)
+            driven = _drives(part, first, expert or model, rollout, config)
             for ref, rows in zip(part, driven, strict=True):
                 number = len(names)
                 names.append(ref.id)
@@ -224,7 +204,6 @@ def _drives(
     refs: Sequence[CaseRef],
     first: int,
     expert: tuple[Policy, Params],
-    learner: tuple[Policy, Params] | None,
     rollout: RolloutConfig,
     config: DriveConfig,
 ) -> Iterator[list[dict]]:
@@ -232,12 +211,11 @@ def _drives(
     cases = with_destinations(build(refs, config.duration_s), first, config)
     fill = np.minimum(np.arange(CHUNK), len(refs) - 1)
     full = jax.tree.map(lambda leaf: leaf[fill], cases)
-    first_driver, takeover = (learner, expert) if learner else (expert, None)
-    record, _, scenes = drive_cases(*first_driver, full, rollout, takeover=takeover)
+    record, _, scenes = drive_cases(*expert, full, rollout)
     for i in range(len(refs)):
         one = lambda x, i=i: x[i]  # noqa: E731
         logs = jax.tree.map(one, record), jax.tree.map(one, scenes)
-        yield list(_rows(*logs, config, learner is not None))
+        yield list(_rows(*logs, config))
 
 
 def with_destinations(cases: Case, first: int, config: DriveConfig) -> Case:

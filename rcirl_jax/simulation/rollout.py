@@ -82,8 +82,6 @@ class RolloutConfig:
     command_delay: int = 0
     # m/s^3, how fast the ego's braking may build up; None: as the actuator does
     braking_jerk: float | None = None
-    # steps that the policy, then the takeover policy drive in turn (where there is one)
-    takeover_schedule: tuple[int, int] = (80, 140)
     # steps between two planning frames that are kept; 0: none
     frames_every: int = 0
     vehicle: Vehicle = dataclasses.field(default_factory=Vehicle)
@@ -246,17 +244,13 @@ def _compiled(policy: Policy, plan_every: int, length: int, vehicle: Vehicle) ->
 
 
 def rollout(
-    drivers: Sequence[tuple[Policy, Params]],
-    cases: Case,
-    config: RolloutConfig,
+    policy: Policy, params: Params, cases: Case, config: RolloutConfig
 ) -> tuple[list[jax.Array], list[Scene]]:
     """Drive cases [B] from start to end, side by side.
 
-    Two drivers drive in turn, the first for `takeover_schedule[0]` steps, then the
-    other for `takeover_schedule[1]`.
-
     Args:
-      drivers: who drives: one, or two in turn; policies with their weights.
+      policy: who drives.
+      params: its weights.
       cases: leaves [B, ...].
       config: of the rollout.
 
@@ -266,27 +260,13 @@ def rollout(
       configuration asks for.
     """
     cases, length = _completed(cases), config.span
-    programs = [
-        (_compiled(policy, config.plan_every, length, config.vehicle), params)
-        for policy, params in drivers
-    ]
-    manner = config.manner()
-    steers = _steers(drivers[0][0])
-    if any(_steers(policy) != steers for policy, _ in drivers):
-        raise InputError("takeover: one plans paths: expected both or neither to")
+    program = _compiled(policy, config.plan_every, length, config.vehicle)
+    manner, steers = config.manner(), _steers(policy)
     now, limits = _begin(cases, steers)
     logs, frames = [], []
-    first, second = config.takeover_schedule
-    if len(programs) > 1 and (first % length or second % length):
-        raise InputError(
-            f"takeover_schedule: {first}, {second}: expected multiples of {length} "
-            "steps"
-        )
     for at in range(0, config.steps, length):
         if config.frames_every and at % config.frames_every == 0:
             frames.append(_seen(cases, now.worlds, limits, steers))
-        others = len(programs) > 1 and at % (first + second) >= first
-        program, params = programs[int(others)]
         now, made = program(params, cases, manner, limits, now)
         logs.append(made)
     return logs, frames
@@ -407,7 +387,6 @@ def drive_cases(
     config: RolloutConfig,
     reduce: Callable[[Record], Logs] | None = None,
     *,
-    takeover: tuple[Policy, Params] | None = None,
     keep: bool = False,
 ) -> Logs:
     """All cases [B]: (records, snapshots, frames), or what `reduce` makes of them.
@@ -421,7 +400,6 @@ def drive_cases(
       cases: leaves [B, ...].
       config: of the rollouts.
       reduce: record [S] -> what is wanted of it.
-      takeover: policy and weights that drive in turn with the first.
       keep: with `reduce` (what it makes, logs) instead.
 
     Returns:
@@ -430,13 +408,12 @@ def drive_cases(
     """
     total = cases.steps.shape[0]
     in_groups = total % LANES == 0 and jax.default_backend() == "cpu"
-    drivers = [(policy, params), *([takeover] if takeover else [])]
     steers = _steers(policy)
 
     def group(first: int) -> Logs:
         lanes = slice(first, first + (LANES if in_groups else total))
         part = jax.tree.map(lambda leaf: leaf[lanes], cases)
-        spans, frames = jax.block_until_ready(rollout(drivers, part, config))
+        spans, frames = jax.block_until_ready(rollout(policy, params, part, config))
         made = reduce and _reducer(reduce, config.steps, steers)(spans, part)
         if reduce and not keep:
             return jax.block_until_ready(made)

@@ -1,14 +1,10 @@
 """Training data of a run: recorded, and simulated where nobody recorded.
 
-A reward tuned on some roads must not unlearn the others. So an expert drives the
-catalogue (other seeds than the suite's), and in each further round the reward learned
-so far drives, from which the expert takes over in turn: the way out of where the
-learner's own mistakes lead becomes a demonstration too (DAgger, Ross et al. 2011, with
-takeovers). What is driven is a dataset like any other, with a weight of its own.
-
-Drives of weight 0 are not learned from. They show what a reward with a prior cost
-(`tuning.prior_cost`) has to leave to that cost; in further rounds that reward drives
-alone, and shows where it gets to by itself.
+A reward tuned on some roads must not unlearn the others. So an expert may drive the
+catalogue (other seeds than the suite's). What is driven is a dataset like any other,
+with a weight of its own. Drives of weight 0 are not learned from: they show where a
+reward with a prior cost whose gain varies (`tuning.prior_cost`) has to leave the choice
+to that cost.
 """
 
 import dataclasses
@@ -29,7 +25,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import checked_own_cost, table_rows
 from rcirl_jax.planner.own_cost import is_place
 from rcirl_jax.planner.rank import Params, Policy, online
-from rcirl_jax.runtime.pipeline import digest, file_sha256
+from rcirl_jax.runtime.pipeline import digest
 from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
 from rcirl_jax.simulation.rows import baseline_row, drawn_weights, mobil_row
 from rcirl_jax.simulation.suite import suite_refs
@@ -37,7 +33,6 @@ from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.tuning.prior_cost import fit_prior_cost
 from rcirl_jax.tuning.recipes import SimulatedDemonstrations
 from rcirl_jax.tuning.run import Run
-from rcirl_jax.tuning.stages import train_one
 
 
 def source(run: Run, given: str | Logs, number: int) -> Dataset:
@@ -86,54 +81,39 @@ def as_one(
 def with_simulated(
     run: Run, sources: Sequence[Dataset], shares: Sequence[float] | None
 ) -> Demonstrations:
-    """The sources and the simulated demonstrations as one; each round trains first."""
+    """The sources and the simulated demonstrations, if there are any, as one."""
     plan, made = run.config.simulated, [*sources]
     given = list(shares or [float(s.indices("train").size) for s in sources])
     # a recorded source has the weight 1, whatever the shares add up to
     scale = len(sources) / sum(given)
     given = [share * scale for share in given]
-    recorded = tuple(given)
-    joined = as_one(made, given)
-    drives: list[Dataset] = []
-    for number in range(plan.datasets):
-        learner = None
-        if number:
-            learner = run.folder / "rounds" / f"{number}.msgpack"
-            prior = fit_prior_cost(run, sources, recorded, drives)
-            stage = f"demonstrate learner {number}"
-            train_one(run, stage, joined, 0, learner, prior)
-        drives.append(_round(run, number, learner))
-        if plan.weights[number] > 0.0:
-            made.append(drives[-1])
-            given.append(plan.weights[number])
-            joined = as_one(made, given)
+    recorded, drives = tuple(given), [] if plan.expert == "none" else [_drives(run)]
+    if drives and plan.weight > 0.0:
+        made += drives
+        given.append(plan.weight)
     fit_prior_cost(run, sources, recorded, drives)
-    return joined
+    return as_one(made, given)
 
 
-def _round(run: Run, number: int, learner: Path | None) -> Dataset:
-    """Drives a round; the expert's alone without a learner."""
+def _drives(run: Run) -> Dataset:
+    """The expert's drives."""
     plan, incumbent = run.config.simulated, run.config.incumbent
     inputs = {
         "simulated_demonstrations": dataclasses.asdict(plan),
-        "number": number,
         "expert": run.incumbent_hash() if plan.expert != "driver model" else "",
-        "learner": file_sha256(learner) if learner else "",
         **run.candidates,
     }
     key = digest({**inputs, **run.code()})[:8]
-    folder = run.folder / f"demonstrations-{key}" / str(number)
+    folder = run.folder / f"demonstrations-{key}"
     work = functools.partial(
-        drive_round,
-        number,
+        drive_expert,
         plan,
         folder,
         config=run.config.train,
         incumbent=incumbent,
-        learner=learner,
         before_commit=run.sign,
     )
-    return _made(run, f"demonstrate {number}", inputs, folder, work)
+    return _made(run, "demonstrate", inputs, folder, work)
 
 
 def _made(
@@ -185,45 +165,31 @@ def expert_of(
     return row.policy, row.params
 
 
-def drive_round(
-    number: int,
+def drive_expert(
     plan: SimulatedDemonstrations,
     output: Path,
     *,
     config: TrainConfig,
     incumbent: str,
-    learner: Path | None,
     before_commit: Callable[[Dataset], object],
 ) -> Dataset:
     """Drives the catalogue and keeps what the expert did.
 
     Args:
-      number: 0: the expert alone; else the round.
       plan: which cases, how long, how densely.
       output: dataset folder.
       config: as `expert_of`.
       incumbent: as `expert_of`.
-      learner: weights file of the reward learned so far; None in round 0.
       before_commit: as `DatasetWriter.finish`.
     """
-    expert, driven = expert_of(plan, incumbent, config), None
-    if learner is not None:
-        row = table_rows([str(learner)], ())[0]
-        driven = row.policy, row.params
-    if driven and not plan.weight:
-        expert, driven = driven, None
     drives = DriveConfig(
-        duration_s=plan.duration_s,
-        stride_s=plan.takeover_stride_s if driven else plan.stride_s,
-        test_fraction=0.0,
+        duration_s=plan.duration_s, stride_s=plan.stride_s, test_fraction=0.0
     )
-    cases = plan.takeover_cases if number else plan.cases
     drive_catalogue(
-        suite_refs("full", cases, plan.catalogue_seed + number),
+        suite_refs("full", plan.cases, plan.catalogue_seed),
         output,
         drives,
-        expert=expert,
-        learner=driven,
+        expert=expert_of(plan, incumbent, config),
         overwrite=True,
         before_commit=before_commit,
     )

@@ -59,6 +59,7 @@ DRIVE_S = 8.0  # of a held-out drive
 USUAL_S = 60.0
 # the last part of each stage, by the names of stages.json
 LAST = {
+    "demonstrate": "demonstrate",
     "train": "export",
     "rank": "rank recorded",
     "simulate": "likeness",
@@ -264,7 +265,7 @@ def work_of(
     config, plan = run.config, run.config.simulated
     counts = {name: dataset.indices(name).size for name in ("train", "test")}
     learned = TRAINED_S * counts["train"] * config.train.epochs
-    cases = plan.cases + plan.rounds * plan.takeover_cases if plan.datasets else 0
+    cases = 0 if plan.expert == "none" else plan.cases
     demonstrated = DRIVEN_S * len(suite_refs("full", 1)) * cases * plan.duration_s
     recorded = min(config.drives, counts["test"]) * DRIVE_S
     driven = len(job.refs) * job.duration_s + recorded
@@ -274,7 +275,7 @@ def work_of(
     if config.prior_cost.wanted or config.train.residual_on:
         turned += (len(settings) - 2) * some
     return {
-        "demonstrate": demonstrated + (plan.rounds * learned if plan.datasets else 0.0),
+        "demonstrate": demonstrated,
         "train": config.seeds * learned,
         "rank": SEARCH_S + 2.0 * RANKED_S * counts["test"],
         "simulate": DRIVEN_S * rows_of(job) * driven,
@@ -321,8 +322,7 @@ class Clock:
         text += f"{in_words(now - self._start)} so far"
         if work is not None:
             # what an earlier run has finished will be kept, unless something changed
-            last = f"demonstrate {self._run.config.simulated.datasets - 1}"
-            ends = {} if done else {"demonstrate": last, **LAST}
+            ends = {} if done else LAST
             to_do = [n for n in self._names[number:] if ends.get(n) not in self._known]
             left = sum(work.get(one, 0.0) for one in to_do)
             left *= (self._took + USUAL_S) / (self._worked + USUAL_S)

@@ -280,7 +280,7 @@ def fit_prior_cost(
     drives: Sequence[Dataset],
 ) -> Path | None:
     """The prior cost, fitted on recordings against simulated drives, if wanted."""
-    config, path = run.config, prior_cost_file(run, len(drives))
+    config, path = run.config, prior_cost_file(run)
     if path is None:
         return None
     inputs = {
@@ -301,14 +301,13 @@ def fit_prior_cost(
         )
         write_prior_cost(path, made)
 
-    run.stage(f"prior cost {len(drives)}", inputs, [path], work)
+    run.stage("prior cost", inputs, [path], work)
     return path
 
 
-def prior_cost_file(run: Run, drives: int) -> Path | None:
-    """Returns the file of the prior cost against so many sets of drives, or None."""
-    wanted = run.config.prior_cost.wanted
-    return run.folder / "prior_costs" / f"{drives}.json" if wanted else None
+def prior_cost_file(run: Run) -> Path | None:
+    """Returns the file of the prior cost, or None."""
+    return run.folder / "prior_cost.json" if run.config.prior_cost.wanted else None
 
 
 def on_own_cost(run: Run, sources: Sequence[Dataset]) -> Run:

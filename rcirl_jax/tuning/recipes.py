@@ -48,22 +48,14 @@ class SimulatedDemonstrations:
 
     # who drives, one of EXPERTS
     expert: str = "none"
-    # cases of each family that the expert drives, and those of a further round
+    # cases of each family, and their seed
     cases: int = 12
-    takeover_cases: int = 16
-    # further rounds: the expert takes over from the reward learned so far, or (weight
-    # 0) that reward drives alone
-    rounds: int = 1
-    # seed of the cases; round r has this one plus r
     catalogue_seed: int = 1000
-    # s of a drive, and between two scenes of the expert's drives and of takeovers
+    # s of a drive, and between two of its scenes
     duration_s: float = 120.0
     stride_s: float = 3.0
-    takeover_stride_s: float = 1.5
-    # weight of the expert's drives, and of each round, where a recorded source has 1;
-    # 0: not learned from
+    # where a recorded source has 1; 0: not learned from
     weight: float = 1.2
-    takeover_weight: float = 0.8
 
     def __post_init__(self) -> None:
         """Rejects values out of range."""
@@ -71,26 +63,12 @@ class SimulatedDemonstrations:
         for name, fits, expected in (
             ("expert", self.expert in EXPERTS, f"one of {', '.join(EXPERTS)}"),
             ("cases", self.cases >= 1, "at least 1"),
-            ("takeover_cases", self.takeover_cases >= 1, "at least 1"),
-            ("rounds", self.rounds >= 0, "at least 0"),
             ("catalogue_seed", self.catalogue_seed > SUITE_SEED, above),
             ("weight", self.weight >= 0.0, ">= 0"),
-            ("takeover_weight", self.takeover_weight > 0.0, "> 0"),
         ):
             if not fits:
                 value = getattr(self, name)
                 raise InputError(f"{name}: {value}: expected {expected}")
-
-    @property
-    def datasets(self) -> int:
-        """Number of datasets: the expert's drives and one for each round."""
-        return 0 if self.expert == "none" else 1 + self.rounds
-
-    @property
-    def weights(self) -> tuple[float, ...]:
-        """Weight of each dataset, in their order."""
-        again = self.takeover_weight if self.weight else 0.0
-        return (self.weight, *[again] * self.rounds)[: self.datasets]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -196,7 +174,7 @@ def load_recipe(name: str) -> Recipe:
     seeds = tuned.get("seeds", 1)
     if type(seeds) is not int or seeds < 1:
         raise InputError(f"{path}: [autotune] seeds: {seeds}: expected at least 1")
-    if prior_cost.low < prior_cost.high and not simulated.datasets:
+    if prior_cost.low < prior_cost.high and simulated.expert == "none":
         raise InputError(
             f"{path}: [{SIMULATED}] expert: none: expected one where the gain of "
             "[prior_cost] varies: its drives show what was not recorded"
@@ -205,10 +183,11 @@ def load_recipe(name: str) -> Recipe:
         where = f"{path}: [train] residual_on: {trained.residual_on}"
         if trained.residual_on != "own cost":
             raise InputError(f'{where}: expected "own cost", the incumbent\'s')
-        if prior_cost.wanted or simulated.rounds or not simulated.weight:
+        nobody = simulated.expert == "none" or not simulated.weight
+        if prior_cost.wanted or nobody:
             raise InputError(
                 f"{where}: expected no [prior_cost], and [{SIMULATED}] with a weight "
-                "above 0 and no rounds: they show where nobody was recorded"
+                "above 0: they show where nobody was recorded"
             )
     return Recipe(
         name=path.stem if name in known else name,

@@ -1,9 +1,8 @@
 """One tuning run: its folder, its stages, its incumbent, its provenance.
 
 RUN/dataset-KEY/       the import of each log, unless datasets are given
-RUN/demonstrations-KEY/N/   simulated: the expert's drives, then each round's
-RUN/rounds/N.msgpack   the reward that the expert of round N takes over from
-RUN/prior_costs/N.json how far the recordings reach, against N sets of drives
+RUN/demonstrations-KEY/ simulated: the expert's drives
+RUN/prior_cost.json    gains, and how far the recordings reach
 RUN/train-KEY/seed-N/  training runs; KEY changes with what they are made from
 RUN/seeds/N.msgpack    every seed's reward
 RUN/weights.msgpack    the candidate: of the seeds the one with the median share of

@@ -89,7 +89,7 @@ def train_seeds(run: Run, dataset: Demonstrations, sources: Sequence[Dataset]) -
       sources: of it, what was recorded.
     """
     files = run.seed_files
-    prior = prior_cost_file(run, run.config.simulated.datasets)
+    prior = prior_cost_file(run)
     run = on_own_cost(run, sources)
     for number, file in enumerate(files):
         train_one(run, f"train {number}", dataset, number, file, prior)

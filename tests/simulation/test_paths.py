@@ -13,14 +13,14 @@ from rcirl_jax.planner.rank import ONLINE_PATHS, RankConfig
 from rcirl_jax.planner.safety import SafetyConfig
 from rcirl_jax.reward.speed_dp import SPEED_DP_ROW
 from rcirl_jax.simulation.cases import EgoState
-from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases, first_scenes
+from rcirl_jax.simulation.rollout import first_scenes
 from rcirl_jax.simulation.rows import baseline_row
 from rcirl_jax.simulation.world import Vehicle, drive, lane_centre
 from rcirl_jax.simulators.drive import Driver
 from rcirl_jax.units import STATION_STEP_M
 from tests.helpers.own_planner import drawn_reward
-from tests.simulation.drives import constant, stack
 from tests.simulation.drives import drive as drive_all
+from tests.simulation.drives import stack
 from tests.simulation.worlds import make_case
 
 PATHS = RankConfig(sampler=ONLINE_PATHS, safety=SafetyConfig(entry=True))
@@ -101,12 +101,6 @@ def test_offsets_are_from_the_lane_that_goes_on():
     now = EgoState(**dict.fromkeys(EgoState.__dataclass_fields__, jnp.float32(0.0)))
     lanes = jax.tree.map(jnp.asarray, case.road)
     assert float(lane_centre(lanes, now.replace(l=jnp.float32(9.0)))) == 3.5
-
-
-def test_drivers_in_turn_plan_alike():
-    both = (ROW.policy, ROW.params), (constant, jnp.float32(0.0))
-    with pytest.raises(InputError, match="takeover: one plans paths"):
-        drive_cases(*both[0], stack([road()]), RolloutConfig(steps=5), takeover=both[1])
 
 
 def test_weights_plan_what_they_were_trained_to_plan(tmp_path):

@@ -205,13 +205,9 @@ def test_plan_every_has_to_divide_the_steps(bad):
         RolloutConfig(**bad)
 
 
-def test_frames_and_turns_begin_with_a_span():
+def test_frames_begin_with_a_span():
     with pytest.raises(InputError, match=r"frames_every: 12: .* multiple of 5 steps"):
         RolloutConfig(frames_every=12)
-    config, case = RolloutConfig(steps=20, takeover_schedule=(7, 5)), make_case()
-    both = constant, jnp.float32(0.0)
-    with pytest.raises(InputError, match=r"takeover_schedule: 7, 5: .* of 5 steps"):
-        drive_cases(*both, stack([case]), config, takeover=both)
 
 
 def test_what_lasts_as_long_as_it_will_is_one_program():
@@ -224,19 +220,3 @@ def test_what_lasts_as_long_as_it_will_is_one_program():
     assert len(made) <= 2  # tables of other lengths here; one where those are alike
     record, _ = drive([make_case(speed=10.0)], steps=7)
     assert record.s.shape == (1, 7)
-
-
-def test_policy_and_takeover_policy_take_turns():
-    """The policy brakes for 3 s, the other accelerates for 2 s, and again."""
-    config = RolloutConfig(steps=100, takeover_schedule=(30, 20))
-
-    record, *_ = drive_cases(
-        constant,
-        jnp.float32(-1.0),
-        stack([make_case(speed=20.0)]),
-        config,
-        takeover=(constant, jnp.float32(1.0)),
-    )
-    command = np.asarray(record.command)[0]
-    expected = np.where(np.arange(100) % 50 < 30, -1.0, 1.0)
-    np.testing.assert_array_equal(command, expected)

@@ -5,7 +5,6 @@ import types
 import pytest
 
 from rcirl_jax.tuning import loop
-from rcirl_jax.tuning.recipes import SimulatedDemonstrations
 
 NAMES = ("import", "demonstrate", "train", "rank")
 WORK = {"demonstrate": 60.0, "train": 120.0, "rank": 60.0}
@@ -28,11 +27,11 @@ class Time:
 
 def a_run(*finished):
     """What the clock reads of a run of which an earlier process has finished stages."""
-    simulated = SimulatedDemonstrations(expert="own cost", rounds=1)
     return types.SimpleNamespace(
-        said=[], done=[], config=types.SimpleNamespace(simulated=simulated),
+        said=[],
+        done=[],
         stages=types.SimpleNamespace(read=lambda: dict.fromkeys(finished)),
-    )  # fmt: skip
+    )
 
 
 def begun(run, monkeypatch):
@@ -66,7 +65,7 @@ def test_the_time_left_grows_with_what_is_not_compiled(monkeypatch):
 
 
 def test_stages_of_an_earlier_run_take_no_time_until_something_changes(monkeypatch):
-    run = a_run("demonstrate 1", "export")
+    run = a_run("demonstrate", "export")
     time, clock = begun(run, monkeypatch)
     clock.begin("demonstrate", WORK)
     assert " about 1 min left" in run.said[-1]
