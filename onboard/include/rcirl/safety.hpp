@@ -269,7 +269,7 @@ inline Entries entries(const Ego& ego, const Obstacle& box, const SafetyLimits& 
     for (std::size_t k = 0; k < kLanes; ++k) {
       const float s = x[t].s.at[k], v = x[t].v.at[k];
       const bool in = beside(box, t, x[t].l.at[k]) < reach && beside(box, t, x[0].l.at[k]) >= reach;
-      const bool enters = in && found.in[t - 1].at[k] == 0.0f;
+      const bool enters = in && found.in[t - 1].at[k] < 0.5f;
       const bool ahead = 0.5f * (box.s_lower[t] + box.s_upper[t]) > s;
       found.in[t].at[k] = in ? 1.0f : 0.0f;
       if (!enters) continue;
@@ -278,7 +278,7 @@ inline Entries entries(const Ego& ego, const Obstacle& box, const SafetyLimits& 
       const float needs = speed > 0.0f ? speed * limits.rear_reaction + brakes : 0.0f;
       const bool near = ahead ? box.s_lower[t] - s - half < rss_distance(v, lead, limits)
                               : s - half - box.s_upper[t] < needs + limits.standstill;
-      if (near && found.crowds.at[k] == kNever) found.crowds.at[k] = at;
+      if (near) found.crowds.at[k] = std::min(found.crowds.at[k], at);
     }
   }
   return found;
@@ -298,7 +298,7 @@ inline void meet_entry(const Ego& ego, const Obstacle& box, std::size_t obstacle
       const float before = box.s_lower[end] - x[end].s.at[k] - half;
       const bool in_way = beside(box, end, x[end].l.at[k]) < reach && middle_s > x[end].s.at[k];
       const bool stuck = in_way && before < limits.room && before < now - kNearerM;
-      if (stuck && keys.at[k] == kNever) keys.at[k] = static_cast<float>(end);
+      if (stuck) keys.at[k] = std::min(keys.at[k], static_cast<float>(end));
     }
   }
   first->meet(keys, obstacle);
