@@ -7,8 +7,10 @@ import pytest
 
 from benchmarks.common import untrained
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.evaluation.gate.types import GateConfig
+from rcirl_jax.export.closed_loop import gate_baselines, table_rows
 from rcirl_jax.features import feature_map
+from rcirl_jax.planner.mobil import MOBIL_ROW
 from rcirl_jax.planner.rank import ONLINE_PATHS, RankConfig
 from rcirl_jax.planner.safety import SafetyConfig
 from rcirl_jax.reward.speed_dp import SPEED_DP_ROW
@@ -110,6 +112,7 @@ def test_weights_plan_what_they_were_trained_to_plan(tmp_path):
     asked = [str(tmp_path / "w.msgpack")], ["hand-set", SPEED_DP_ROW, "IDM"]
     steers = lambda **how: [row.steers for row in table_rows(*asked, **how)]  # noqa: E731
     assert reward.mode == "path_speed"
+    assert MOBIL_ROW in gate_baselines(asked[0][0], GateConfig())
     assert steers() == [True, True, False, False]
     assert steers(mode="speed") == [True, False, False, False]
     assert steers(dp=True) == [True, True, True, True, False, False]

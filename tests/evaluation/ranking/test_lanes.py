@@ -1,17 +1,22 @@
 """Which lane is chosen, and when its line is crossed, on scenes made by hand."""
 
+import dataclasses
+import json
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rcirl_jax.evaluation.ranking.lanes import (
     LaneOutcomes,
+    LaneReport,
     Lanes,
     lane_metrics,
     lane_report,
     lanes_of,
 )
 from rcirl_jax.planner.mobil import MOBIL_ROW
+from rcirl_jax.runtime.checked import checked
 from rcirl_jax.units import TIMES_S
 from tests.helpers.scenes import scene
 
@@ -78,4 +83,6 @@ def test_the_report_counts_each_group_of_scenes():
     assert keeps == {"good": 1.0, MOBIL_ROW: 0.5}
     assert report.rows["good"]["right_side"].exact
     assert report.minus_mobil["good"].mean == pytest.approx(0.5)
+    stored = json.loads(json.dumps(dataclasses.asdict(report)))
+    assert checked(stored, LaneReport, "lanes") == report
     assert lane_report(table, twice, np.zeros(4, int)) is None
