@@ -139,7 +139,7 @@ def run_suite(
     hashes = {name: result_hash(found) for name, found in runs.items()}
     timings = {}
     for row in rows:
-        seconds, steps = timed[row.name][1], row.plan_every or config.plan_every
+        seconds, steps = timed[row.name][1], config.plan_every
         plans = len(cases.ids) * round(cases.duration_s / STEP_S) / steps
         timings[row.name] = {
             "seconds": round(seconds, 2),
