@@ -225,6 +225,9 @@ def complaint(error: flags.Error, main: Callable) -> str:
       error: of absl; those of values say "flag --NAME=VALUE: why".
       main: of the command, whose docstring has an example.
     """
+    cause = error.__context__
+    if isinstance(error, flags.CantOpenFlagFileError) and isinstance(cause, OSError):
+        return f"--flagfile: {_about(cause)}: expected a file of flags, one a line"
     found = re.findall(r"^flag --(\w+)=(.*?): (.*)$", str(error), re.M)
     missing = [name for name, value, _ in found if value == "None"]
     if missing:

@@ -225,6 +225,7 @@ def test_a_flag_that_is_missing_is_named_with_an_example(name, every):
         ("rank --horizon=9", "--horizon: 9: expected a number in the range [0.4"),
         ("sweep --trials=0", "--trials: 0: expected a positive integer"),
         ("sweep --trails=9", "Did you mean: trials"),
+        ("rank --flagfile=nix", "error: --flagfile: nix: No such file or directory: "),
     ],
 )
 def test_a_wrong_command_is_one_line(words, message, tmp_path):
