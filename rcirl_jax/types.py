@@ -180,17 +180,6 @@ class Normaliser(flax.struct.PyTreeNode, kw_only=True):
     scale: jax.Array  # [F] > 0
 
 
-class Familiarity(flax.struct.PyTreeNode, kw_only=True):
-    """Weights of `reward.familiarity`; H hidden units."""
-
-    location: jax.Array  # [F] in the feature's unit
-    scale: jax.Array  # [F] > 0
-    kernel: jax.Array  # [F, H] W
-    bias: jax.Array  # [H] b
-    out: jax.Array  # [H]
-    offset: jax.Array  # [] c
-
-
 # the reward's parameters, raw or effective: Flax's tree {"gamma", "point", ...} of
 # `reward.network.RewardModel`
 RewardParams = Mapping[str, Any]

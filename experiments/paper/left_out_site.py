@@ -53,7 +53,7 @@ from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import Running
 from rcirl_jax.train.parallel import share_cores
 from rcirl_jax.tuning.loop import tune
-from rcirl_jax.tuning.recipes import PriorCostConfig, SimulatedDemonstrations
+from rcirl_jax.tuning.recipes import SimulatedDemonstrations
 from rcirl_jax.tuning.run import Run, TuneConfig
 from rcirl_jax.tuning.stages import IDM_EVALUATIONS
 
@@ -96,10 +96,10 @@ def _half(number: int) -> str:
 def tuned(name: str, datasets: Sequence[str]) -> Run:
     """Tunes the recipe on datasets, in a folder of a name."""
     chosen = recipe()
-    train, on = chosen.train, (chosen.simulated, chosen.prior_cost)
+    train, on = chosen.train, (chosen.simulated, chosen.gain)
     if QUICK.value:  # V alone: no catalogue is driven
         train = dataclasses.replace(train, epochs=QUICK_COUNTS["epochs"])
-        on = SimulatedDemonstrations(), PriorCostConfig()
+        on = SimulatedDemonstrations(), 0.0
     made = Run(
         folder=Path(OUTPUT.value) / name.replace(" ", "_"),
         config=TuneConfig(
@@ -107,7 +107,7 @@ def tuned(name: str, datasets: Sequence[str]) -> Run:
             gate=GateConfig(),
             incumbent=_INCUMBENT.value,
             simulated=on[0],
-            prior_cost=on[1],
+            gain=on[1],
             recipe=chosen.name,
             seeds=len(seeds()),
         ),

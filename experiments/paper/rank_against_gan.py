@@ -88,13 +88,13 @@ from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
 from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.tuning.prior_cost import OWN_COST, PriorCostConfig, fitted_prior_cost
+from rcirl_jax.tuning.prior_cost import OWN_COST
 from rcirl_jax.types import Scene
 
 _LOSSES = flags.DEFINE_list(
     "losses", None, "default: rank, gan, and listwise unless the recipe's own is rank"
 )
-_SHARE = flags.DEFINE_float("share", 0.019, "g, above 0", 0.0)
+_SHARE = flags.DEFINE_float("share", 0.009, "g, above 0", 0.0)
 _CASES = flags.DEFINE_integer("cases", 12, "of each family", lower_bound=1)
 _DURATION = flags.DEFINE_float("duration", FULL_S, "s of a case", 1.0)
 _SEED = flags.DEFINE_integer("catalogue_seed", 0, "of the cases", lower_bound=0)
@@ -156,12 +156,6 @@ def trained(
     return found, seen_range(fitting_rows(frozen, shared), features)
 
 
-def fitted() -> PriorCost:
-    """The prior cost with g for its gain."""
-    gain = PriorCostConfig(low=_SHARE.value, high=_SHARE.value)
-    return fitted_prior_cost(gain, [], [], [], feature_map(recipe().train.features))
-
-
 def some_scenes(sources: Sequence[Demonstrations]) -> tuple[Scene, np.ndarray]:
     """Training scenes, as many of every source, and their rows; numpy leaves."""
     each = [one.indices("train") for one in sources]
@@ -188,7 +182,7 @@ def spread(scenes: Scene, rows: jax.Array, score: Score, params: Params) -> jax.
 
 def written(
     learned: Sequence[Learned],
-    prior_cost: PriorCost,
+    share: float,
     data: Demonstrations,
     sources: Sequence[Demonstrations],
     seen: np.ndarray,
@@ -215,8 +209,7 @@ def written(
         file = save("alone", one, None)
         of = spreads[file] = float(spread(scenes, rows, *score_of(open_reward(file))))
         unit = spreads[OWN_COST] / of
-        gains = {"low": prior_cost.low * unit, "high": prior_cost.high * unit}
-        save("anchored", one, dataclasses.replace(prior_cost, **gains))
+        save("anchored", one, PriorCost(incumbent=OWN_COST, gain=share * unit))
     return {**files["alone"], **files["anchored"]}, spreads
 
 
@@ -315,7 +308,7 @@ def main() -> None:
     learners, how = with_chosen_rates(data, learners)
     learned, seen = trained(data, learners)
     each = [*sources.values()]
-    files, spreads = written(learned, fitted(), data, each, seen)
+    files, spreads = written(learned, _SHARE.value, data, each, seen)
     errors = {f"top-1 {site}, m": ranked(one, files) for site, one in sources.items()}
     cases, duration = (1, QUICK_S) if QUICK.value else (_CASES.value, _DURATION.value)
     columns = {**driven(files, cases, duration), **errors}

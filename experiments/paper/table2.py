@@ -40,7 +40,7 @@ _WEIGHTS = flags.DEFINE_list("weights", None, "weights files instead of training
 _DP_CASES = flags.DEFINE_integer("dp_cases", 2, "cases per family of the DP rows", 1)
 undefine_flags("cases", "duration", "catalogue_seed", "horizon")
 fixed(seeds=2)
-TRAINING = (*("data", "recipe", "losses", "share", "seeds", "epochs", "positive"),)
+TRAINING = ("data", "recipe", "losses", "share", "seeds", "epochs", "positive")
 
 
 def trained() -> dict[str, str]:
@@ -49,8 +49,8 @@ def trained() -> dict[str, str]:
     learners, _ = with_chosen_rates(data, rank_against_gan.configs())
     learned, seen = rank_against_gan.trained(data, learners)
     each = [*sources.values()]
-    prior_cost = rank_against_gan.fitted()
-    files, _ = rank_against_gan.written(learned, prior_cost, data, each, seen)
+    share = float(flags.FLAGS["share"].value or 0.0)
+    files, _ = rank_against_gan.written(learned, share, data, each, seen)
     first = f" {seeds()[0]}"
     names = [name for name in files if name.endswith(first)]
     return {name.removesuffix(first): files[name] for name in names}

@@ -25,7 +25,7 @@ from tests.helpers.own_planner import drawn_reward, entries, jax_answers
 from tests.helpers.scenes import scene
 
 HERE = Path(__file__).parent
-REWARDS = {"paper21": False, "apollo21": True}  # preset, gains by the scene
+REWARDS = {"paper21": False, "apollo21": True}  # preset, scene gating
 DRAWN = 8  # random scenes
 HEAD = "# Made by onboard/conformance/make.py; README.md says how it reads.\n"
 UNTIL = np.arange(TIMES_S.size) < 9  # a light's first half

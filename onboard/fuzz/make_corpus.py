@@ -39,11 +39,7 @@ def main(_: list[str]) -> None:
         (folder / f"file_{name}").write_bytes(b"\0" + data)
         (folder / f"body_{name}").write_bytes(b"\1" + msgpack.unpackb(data)["body"])
     keys = {*reader.OUTER_KEYS, *reader.BODY, *reader.RANGES, *reader.ACTIVATIONS}
-    keys |= {
-        *reader.BODY["prior_cost"][0],
-        *reader.FAMILIARITY,
-        *reader.BODY["samples"],
-    }
+    keys |= {*reader.BODY["prior_cost"][0], *reader.BODY["samples"]}
     keys |= {"name", "unit", "none_value", "leaky_rate", "hand-set"}
     keys |= {"shape", "dtype", "data", "<f4"}
     lines = [f'"\\x{0xA0 + len(key):x}{key}"' for key in sorted(keys)]

@@ -80,6 +80,9 @@ struct Example {
   std::string activation = "tanh";
   bool scene_gating = false;
   unsigned seed = 0;
+  double gain = 0.0;                 // on the prior cost "hand-set"; 0: no prior cost
+  std::string column0 = "feature0";  // name of the first column, in m
+  float step = 0.5f;                 // s between times
 
   std::vector<float> lower, upper, location, scale, gamma, gates;
   std::vector<std::vector<float>> kernels, biases;
@@ -176,7 +179,8 @@ struct Example {
     const std::size_t size = features;
     std::vector<std::string> columns, layers;
     for (std::size_t f = 0; f < size; ++f) {
-      columns.push_back(column("feature" + std::to_string(f), f == 0 ? "m" : "m/s\u00b2"));
+      columns.push_back(f == 0 ? column(column0, "m")
+                               : column("feature" + std::to_string(f), "m/s\u00b2"));
     }
     std::size_t in = size;
     for (std::size_t i = 0; i < kernels.size(); ++i) {
@@ -186,10 +190,15 @@ struct Example {
       in = out;
     }
     std::vector<float> grid(times);
-    for (std::size_t t = 0; t < times; ++t) grid[t] = 0.5f * static_cast<float>(t);
+    for (std::size_t t = 0; t < times; ++t) grid[t] = step * static_cast<float>(t);
     std::vector<float> ends(2 * size, 1.0f);  // of the training's range
     std::fill_n(ends.begin(), size, -1.0f);
-    std::vector<std::pair<std::string, std::string>> fields = {
+    const std::vector<float> raw = inputs(samples, seed + 1);
+    std::vector<float> values(samples);
+    for (std::size_t i = 0; i < samples; ++i) {
+      values[i] = static_cast<float>(value(&raw[i * times * size], nullptr));
+    }
+    return {
         {"preset", pack::text("test")},
         {"features", pack::list(columns)},
         {"normaliser", pack::map({{"lower", pack::array({size}, lower)},
@@ -203,29 +212,23 @@ struct Example {
         {"activation", pack::text(activation)},
         {"leaky_slope", pack::real(0.01)},
         {"scene_gating", scene_gating ? pack::array({size, size}, gates) : pack::nil()},
-        {"prior_cost", pack::nil()},
+        {"prior_cost", gain > 0.0 ? prior_cost(pack::real(gain)) : pack::nil()},
         {"loss", pack::map({{"name", pack::text("rank")}, {"leaky_rate", pack::nil()}})},
         {"provenance", pack::map({{"seed", pack::natural(7)}})},
-        {"samples", sample_fields(pack::nil())}};
-    return fields;
+        {"samples", pack::map({{"features", pack::array({samples, times, size}, raw)},
+                               {"valid", pack::filled({samples, times}, 1.0f)},
+                               {"value", pack::array({samples}, values)}})}};
+  }
+
+  static std::string prior_cost(const std::string& gain,
+                                const std::string& incumbent = pack::text("hand-set")) {
+    return pack::map({{"incumbent", incumbent}, {"gain", gain}});
   }
 
   static std::string column(const std::string& name, const std::string& unit) {
     return pack::map({{"name", pack::text(name)},
                       {"unit", pack::text(unit)},
                       {"none_value", pack::natural(100)}});
-  }
-
-  std::string sample_fields(const std::string& gains) const {
-    const std::vector<float> raw = inputs(samples, seed + 1);
-    std::vector<float> values(samples);
-    for (std::size_t i = 0; i < samples; ++i) {
-      values[i] = static_cast<float>(value(&raw[i * times * features], nullptr));
-    }
-    return pack::map({{"features", pack::array({samples, times, features}, raw)},
-                      {"valid", pack::filled({samples, times}, 1.0f)},
-                      {"value", pack::array({samples}, values)},
-                      {"gain", gains}});
   }
 
   std::string file() const { return pack::sealed(pack::map(body())); }
@@ -243,5 +246,20 @@ struct Example {
     return pack::sealed(pack::map(fields));
   }
 };
+
+// A reward that reads the station alone, on the usual times, and likes the furthest.
+inline Example likes_speed() {
+  Example example(1, 18, {}, "identity", false);
+  example.column0 = "station";
+  example.step = 8.0f / 17.0f;
+  example.lower = {-1e6f};
+  example.upper = {1e6f};
+  example.location = {0.0f};
+  example.scale = {1.0f};
+  example.gamma.assign(example.times, 1.0f);
+  example.kernels = {{1.0f}};
+  example.biases = {{0.0f}};
+  return example;
+}
 
 #endif  // RCIRL_TESTS_FILES_HPP_

@@ -12,7 +12,7 @@
 
 #include "../adapters/apollo/reward_evaluator.hpp"
 #include "check.hpp"
-#include "with_prior_cost.hpp"
+#include "files.hpp"
 
 namespace {
 
@@ -149,10 +149,17 @@ void test_costs_are_the_scores_of_the_conformance_case(const std::string& folder
   CHECK(found.pairs.back().first == given.along[1]);  // the rough one is the last
 }
 
+// With a gain of 2 on Apollo's cost.
+Example gained() {
+  Example example = likes_speed();
+  example.gain = 2.0;
+  return example;
+}
+
 // V is the sum of stations: 85 m for 1 m/s along the 18 times, twice that at a gain of 2.
 void test_the_gained_value_comes_off_apollos_cost() {
   rcirl::Reward reward;
-  CHECK_TEXT(rcirl::decode(with_gain(likes_speed(), 2.0f), "w", &reward).message(), "");
+  CHECK_TEXT(rcirl::decode(gained().file(), "w", &reward).message(), "");
   const LearnedCost learned(reward);
   std::vector<std::pair<Pair, double>> pairs;
   for (const double v : {10.0, 9.0, 8.0}) {
@@ -202,7 +209,7 @@ void test_without_a_value_apollos_order_stays() {
   Ranked found = ranked(pairs, none, moment.surroundings(), none.status().message());
   CHECK((found.costs == std::vector<double>{1.0, 2.0}));
   rcirl::Reward reward;
-  CHECK(rcirl::decode(with_gain(likes_speed(), 2.0f), "w", &reward).ok());
+  CHECK(rcirl::decode(gained().file(), "w", &reward).ok());
   rcirl::Surroundings nowhere = moment.surroundings();
   nowhere.line.points.clear(), nowhere.line.speed_limit.clear();
   found = ranked(pairs, LearnedCost(reward), nowhere,

@@ -8,13 +8,13 @@
 
 #include "allocations.hpp"
 #include "check.hpp"
+#include "files.hpp"
 #include "rcirl/choose.hpp"
-#include "with_prior_cost.hpp"
 
 namespace {
 
 constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
-constexpr float kDt = kStationDt;
+constexpr float kDt = 8.0f / 17.0f;
 constexpr std::size_t kCount = 40;
 
 rcirl::Reward loaded(const std::string& file) {
@@ -30,8 +30,7 @@ rcirl::Chooser made(const rcirl::Reward& reward) {
 }
 
 rcirl::Chooser usual() {
-  const Example example = likes_speed();
-  return made(loaded(with_station(example, example.body())));
+  return made(loaded(likes_speed().file()));
 }
 
 // A straight road; the ego is 4 m by 2 m, drives at 10 m/s, and a car stands 40 m ahead.

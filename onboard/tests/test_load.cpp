@@ -213,8 +213,7 @@ void test_samples() {
     return e.tampered("samples",
                       pack::map({{"features", pack::array({m, e.times, e.features}, raw)},
                                  {"valid", valid},
-                                 {"value", pack::array({m}, values)},
-                                 {"gain", pack::nil()}}));
+                                 {"value", pack::array({m}, values)}}));
   };
   const std::string ones = pack::filled({3, 4}, 1.0f);
   CHECK_TEXT(refusal(with(ones, {5e-6f, -5e-6f, 0.0f}, 3)), "taken");
@@ -226,8 +225,7 @@ void test_samples() {
   expect(gated.tampered("samples",
                         pack::map({{"features", pack::filled({1, 4, 3}, 0.5f)},
                                    {"valid", late},
-                                   {"value", pack::filled({1}, 0.0f)},
-                                   {"gain", pack::nil()}})),
+                                   {"value", pack::filled({1}, 0.0f)}})),
          "samples.valid[0, 0]: 0: expected 1 at the first time");
 }
 

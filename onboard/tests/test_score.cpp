@@ -8,9 +8,9 @@
 #include <thread>
 #include <vector>
 
-#include "with_prior_cost.hpp"
 #include "allocations.hpp"
 #include "check.hpp"
+#include "files.hpp"
 #include "rcirl/guard.hpp"
 #include "rcirl/reward.hpp"
 
@@ -198,11 +198,11 @@ void test_check_features() {
 }
 
 void test_scoring_allocates_nothing() {
-  const WithPriorCost with_prior_cost(Example(21, 18, {32, 16}, "tanh", true));
-  rcirl::Reward reward;
-  CHECK_TEXT(rcirl::decode(with_prior_cost.file(), "w", &reward).message(), "");
+  Example example(21, 18, {32, 16}, "tanh", true);
+  example.gain = 0.5;
+  const rcirl::Reward reward = loaded(example);
   rcirl::Workspace workspace = reward.workspace();
-  const std::vector<float> features = with_prior_cost.example.inputs(100, 3);
+  const std::vector<float> features = example.inputs(100, 3);
   std::vector<float> values(100);
   const rcirl::Guard guard(reward);
   const long before = allocations;

@@ -280,7 +280,7 @@ def tune(
         gate=GateConfig(),
         incumbent=os.fspath(incumbent),
         simulated=chosen.simulated,
-        prior_cost=chosen.prior_cost,
+        gain=chosen.gain,
         recipe=chosen.name,
         seeds=chosen.seeds,
         drives=drives,

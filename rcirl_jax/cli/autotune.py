@@ -115,7 +115,7 @@ def made_run(folder: Path) -> Run:
         gate=_MARGINS(),
         incumbent=incumbent,
         simulated=simulated,
-        prior_cost=recipe.prior_cost,
+        gain=recipe.gain,
         data_weights=_TRAINING.data_weights,
         recipe=recipe.name,
         seeds=recipe.seeds if _SEEDS.value is None else _SEEDS.value,

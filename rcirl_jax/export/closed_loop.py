@@ -32,7 +32,6 @@ from rcirl_jax.evaluation.closed_loop.suite import (
 )
 from rcirl_jax.evaluation.gate.full_suite import families_sha256, left_out_of_suite
 from rcirl_jax.evaluation.gate.types import (
-    AT_HIGHEST,
     CANDIDATE,
     DRIVES,
     INCUMBENT,
@@ -43,7 +42,6 @@ from rcirl_jax.evaluation.gate.types import (
 from rcirl_jax.evaluation.gate.verdict import judge, repeats
 from rcirl_jax.export.from_run import NUM_SAMPLES, write_weights
 from rcirl_jax.export.loading import (
-    familiarity_of,
     open_reward,
     own_cost_of,
     own_sampler_of,
@@ -144,9 +142,7 @@ def score_of(reward: Reward, own: OwnCost | None = None) -> tuple[Score, Ranking
             f"{reward.file}: prior_cost.incumbent: {prior_cost.incumbent}: expected "
             f"{' or '.join(known)}, whose cost is known here"
         )
-    gains = prior_cost.low, prior_cost.high
-    familiar = familiarity_of(prior_cost)
-    return score, ranking(reward_params(reward), prior_cost.incumbent, gains, familiar)
+    return score, ranking(reward_params(reward), prior_cost.incumbent, prior_cost.gain)
 
 
 def incumbent_score(name: str, own: OwnCost | None = None) -> tuple[Score, Params]:
@@ -279,8 +275,6 @@ class SuiteJob:
     track: str = "full"  # of the safety filter
     # programs and own costs: names of their rows, "" for their own, and places
     planners: tuple[tuple[str, str], ...] = ()
-    # a gate's candidate also at its highest gain everywhere, if its gain varies
-    highest: bool = False
     mode: str | None = None  # of rows without weights, as in `table_rows`
 
     def __post_init__(self) -> None:
@@ -301,12 +295,6 @@ class SuiteJob:
             mode=self.mode,
         )
         rows.sort(key=lambda row: row.name != CANDIDATE)
-        first, params = rows[0], rows[0].params
-        is_candidate = self.highest and first.name == CANDIDATE
-        if is_candidate and isinstance(params, Ranking) and params.low < params.high:
-            everywhere = params.replace(low=params.high)
-            more = dataclasses.replace(first, name=AT_HIGHEST, params=everywhere)
-            rows.insert(1, more)
         return rows
 
     def planner_facts(self) -> dict[str, dict[str, str]]:
@@ -466,7 +454,6 @@ def gate_job(
         plan_every=plan_every,
         tuned_idm=tuned_idm,
         track=track,
-        highest=CANDIDATE in files,
         planners=tuple(planners),
     )
     return job, name

@@ -11,7 +11,7 @@ import numpy as np
 
 from rcirl_jax.data.store.dataset import EQUAL, Demonstrations
 from rcirl_jax.errors import MALFORMED, InputError
-from rcirl_jax.export.reader import FAMILIARITY, MAX_NAME, PriorCost, Reward
+from rcirl_jax.export.reader import MAX_NAME, PriorCost, Reward
 from rcirl_jax.export.weights import save
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.own_cost import OwnCost, is_place, own_cost
@@ -23,7 +23,6 @@ from rcirl_jax.reward import (
     seen_range,
     value,
 )
-from rcirl_jax.reward.familiarity import familiar_nowhere
 from rcirl_jax.reward.network import LEAKY_SLOPE, layers_of
 from rcirl_jax.runtime.atomic_files import read_json
 from rcirl_jax.runtime.checked import typed_settings
@@ -135,7 +134,7 @@ def export_run(
         own = own_cost(config.residual_on) if is_place(config.residual_on) else None
         gain = config.own_unit / math.exp(float(np.asarray(state.params["log_beta"])))
         name = own.name if own else config.residual_on
-        prior_cost = everywhere(name, gain, feature_map(config.features).num_features)
+        prior_cost = PriorCost(incumbent=name, gain=gain)
     if own is not None:
         place = os.path.abspath(own.place)
         provenance["own_cost"] = {"place": place, "sha256": own.sha256}
@@ -149,14 +148,6 @@ def export_run(
         seen,
         prior_cost=prior_cost,
     )
-
-
-def everywhere(incumbent: str, gain: float, size: int) -> PriorCost:
-    """Return a prior cost of `size` features with one gain for all scenes."""
-    known = familiar_nowhere(size)
-    arrays = {name: np.asarray(getattr(known, name)) for name in FAMILIARITY}
-    arrays["offset"] = arrays["offset"].reshape(1)
-    return PriorCost(incumbent=incumbent, low=gain, high=gain, **arrays)
 
 
 def write_weights(

@@ -16,16 +16,13 @@ from rcirl_jax.evaluation.ranking.score import PriorCostScorer, RankingSetup
 from rcirl_jax.export.own_planner.choose import check_times
 from rcirl_jax.export.own_planner.features import FeatureError
 from rcirl_jax.export.reader import (
-    FAMILIARITY,
     RANGES,
-    PriorCost,
     Reward,
     WeightsError,
     load_weights,
 )
 from rcirl_jax.features.mapping import FeatureMap, feature_map
 from rcirl_jax.planner.own_cost import OwnCost, own_cost
-from rcirl_jax.reward.familiarity import Familiarity
 from rcirl_jax.reward.network import LEAKY_SLOPE, point_of
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Normaliser, RewardParams
@@ -120,12 +117,6 @@ def reward_params(reward: Reward) -> tuple[RewardParams, Normaliser]:
     single = functools.partial(jnp.asarray, dtype=jnp.float32)
     ranges = {name: single(getattr(reward, name)) for name in RANGES}
     return jax.tree.map(single, params), Normaliser(**ranges)
-
-
-def familiarity_of(prior_cost: PriorCost) -> Familiarity:
-    """Return a weights file's prior cost as the pytree that JAX code takes."""
-    leaves = {n: jnp.asarray(getattr(prior_cost, n), jnp.float32) for n in FAMILIARITY}
-    return Familiarity(**{**leaves, "offset": leaves["offset"].ravel()[0]})
 
 
 def scorer_of(reward: Reward) -> Scorer | PriorCostScorer:
@@ -264,9 +255,7 @@ def prior_cost_words(name: str, reward: Reward) -> str:
         return ""
     return (
         f"The {name} has a prior cost: it drives by V_total = own cost "
-        f"({prior_cost.incumbent}, negated) + gain V, with a gain from "
-        f"{prior_cost.low:g}, where nothing like the scene was recorded, to "
-        f"{prior_cost.high:g}, where all of it was."
+        f"({prior_cost.incumbent}, negated) + {prior_cost.gain:g} V."
     )
 
 

@@ -8,12 +8,9 @@ gives the byte layout; the equation is
     r_t = act(... act(x_t W_1 + b_1) ...) W_L + b_L          last layer linear
     V   = sum_t gamma_t * time_valid_t * r_t                 higher is better
 
-A reward with a prior cost is driven on the planner's own cost, with a gain that
-depends on how familiar the scene is:
+A reward with a prior cost is driven on the planner's own cost:
 
     V_total = V_incumbent + gain V
-    gain    = low + (high - low) sigmoid(out . tanh(z W + b) + c)
-    z_i     = clip((f_0i - location_i) / scale_i, -5, 5)      f_0 raw, location of it
 
     reward = load_weights("weights.msgpack")
     print(reward.describe())             # what it was trained for, and what not
@@ -37,8 +34,7 @@ import numpy as np
 
 MAGIC = "RCIRLW"  # first value of the outer map
 SCHEMA_VERSION = 1  # the layout that this reader knows
-TOLERANCE = 1e-5  # of max(1, |V|), on a verification sample, float32; of gains too
-REACH = 5.0  # scales from the location beyond which a prior cost's inputs are clipped
+TOLERANCE = 1e-5  # of max(1, |V|), on a verification sample, float32
 
 # Limits, far above any sensible reward (the paper's network is 21 -> 15 -> 1).
 MAX_FILE_BYTES = 64 * 2**20  # bytes
@@ -56,13 +52,9 @@ MAX_DEPTH = 8  # levels of lists and maps, `provenance` itself the first
 OUTER_KEYS = ("magic", "schema_version", "body", "sha256")
 AXES = {
     **{"F": MAX_FEATURES, "T": MAX_TIMES, "m": MAX_SAMPLES},
-    **{"in": MAX_UNITS, "out": MAX_UNITS, "H": MAX_UNITS},
+    **{"in": MAX_UNITS, "out": MAX_UNITS},
 }
 RANGES = dict.fromkeys(("lower", "upper", "location", "scale"), "F")
-FAMILIARITY = {
-    **{"location": "F", "scale": "F", "kernel": "F H", "bias": "H", "out": "H"},
-    "offset": "1",
-}
 # The body, in the order of its keys: the one description of the file, for this reader
 # and for the writer. A map has these keys and no others; a list, rows of one kind; what
 # stands in a tuple may be nil. An array is named by its axes: one name, one length.
@@ -77,17 +69,10 @@ BODY: dict[str, Any] = {
     "activation": "text",
     "leaky_slope": "number",
     "scene_gating": ("F F",),
-    "prior_cost": (
-        {
-            "incumbent": "text",
-            "low": "number",
-            "high": "number",
-            "familiarity": FAMILIARITY,
-        },
-    ),
+    "prior_cost": ({"incumbent": "text", "gain": "number"},),
     "loss": {"name": "text", "leaky_rate": ("number",)},
     "provenance": "plain",
-    "samples": {"features": "m T F", "valid": "m T", "value": "m", "gain": ("m",)},
+    "samples": {"features": "m T F", "valid": "m T", "value": "m"},
 }
 ACTIVATIONS: dict[str, Callable[[np.ndarray, np.float32], np.ndarray]] = {
     "tanh": lambda x, slope: np.tanh(x),
@@ -105,39 +90,12 @@ class WeightsError(ValueError):
         super().__init__("".join(c if c.isprintable() else "?" for c in line))
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class PriorCost:
-    """The gain of V on top of the incumbent's value, by the scene's familiarity."""
+    """The value that V is added to, and how much of V."""
 
-    incumbent: str  # whose value V is added to, at most 64 characters
-    low: float  # gain where the training data do not reach, >= 0
-    high: float  # where they do, >= low
-    location: np.ndarray  # [F] in the feature's unit
-    scale: np.ndarray  # [F] > 0
-    kernel: np.ndarray  # [F, H] W; a feature whose row is 0 does not matter
-    bias: np.ndarray  # [H] b
-    out: np.ndarray  # [H]
-    offset: np.ndarray  # [1] c
-
-    def __repr__(self) -> str:
-        """Return the incumbent and the gains: arrays would fill pages."""
-        return f"PriorCost({self.incumbent}, gain {self.low:g} to {self.high:g})"
-
-    @np.errstate(all="ignore")
-    def gain(self, first: np.ndarray) -> np.ndarray:
-        """Return gains of V, summed in float64.
-
-        Args:
-          first: [..., F] raw features at the first time.
-
-        Returns:
-          float32 [...]; a NaN among the features that matter gives NaN.
-        """
-        z = np.clip((first - self.location.astype(float)) / self.scale, -REACH, REACH)
-        z = np.where(self.kernel.any(axis=1), z, 0.0)
-        hidden = np.tanh(z @ self.kernel + self.bias)
-        share = 1.0 / (1.0 + np.exp(-(hidden @ self.out + self.offset[0])))
-        return np.asarray(self.low + (self.high - self.low) * share).astype(np.float32)
+    incumbent: str  # whose value it is, at most 64 characters
+    gain: float  # > 0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -196,12 +154,11 @@ class Reward:
         """Return lines on what the values mean and what they do not, for a log."""
         prior, last = self.prior_cost, float(self.times[-1])
         lateral = "l was not trained" if self.mode == "speed" else "l was trained"
-        gain = "" if prior is None else f"{_show(prior.low)} to {_show(prior.high)}"
         lines = (
             f"mode: {self.mode}: {lateral}",
             f"features without effect: {', '.join(self.unsupported) or 'none'}",
             "prior cost: "
-            + ("none" if prior is None else f"{prior.incumbent}, gain {gain}"),
+            + (f"{prior.incumbent}, gain {_show(prior.gain)}" if prior else "none"),
             f"times: {len(self.times)} from 0 to {_show(last)} s",
             "safety: none: filter the candidates before you choose",
         )
@@ -236,22 +193,6 @@ class Reward:
             self._needs_first(valid)
         return self._finite("value", self._values(numbers, valid), "finite features")
 
-    def gain(self, features: np.ndarray) -> np.ndarray:
-        """Return how much of V is added to the value of the prior cost.
-
-        Args:
-          features: [..., T, F] raw features at `times`; the first time counts.
-
-        Returns:
-          float32 [...] in [low, high]. A reward without a prior cost raises, and a NaN
-          among the features that matter (whose row of the kernel is not 0).
-        """
-        if self.prior_cost is None:
-            _fail(f"{self.file}: prior_cost", None, "a reward with a prior cost")
-        numbers = self._numbers(features, (len(self.times), len(self.names)))
-        gains = self.prior_cost.gain(numbers[..., 0, :])
-        return self._finite("gain", gains, "finite features at the first time")
-
     def total(
         self,
         features: np.ndarray,
@@ -264,25 +205,25 @@ class Reward:
           features: as `value`.
           incumbent: [...] the incumbent's values (its cost, negated), broadcast to
             the leading axes of the features.
-          time_valid: as `value`; the first time has to be valid.
+          time_valid: as `value`.
 
         Returns:
-          float32 [...]. Raises as `value` and `gain`, and for a sum or an
+          float32 [...]. Raises as `value`, without a prior cost, and for a sum or an
           incumbent's value that is not finite.
         """
-        gains = self.gain(features)
-        if time_valid is not None:
-            shape = (*gains.shape, len(self.times), len(self.names))
-            self._needs_first(self._mask(time_valid, shape))
+        if self.prior_cost is None:
+            _fail(f"{self.file}: prior_cost", None, "a reward with a prior cost")
         values = self.value(features, time_valid)
         try:
-            others = np.broadcast_to(np.asarray(incumbent), gains.shape)
+            others = np.broadcast_to(np.asarray(incumbent), values.shape)
         except (TypeError, ValueError) as error:
-            _fail(f"{self.file}: incumbent", error, f"numbers of shape {gains.shape}")
+            _fail(f"{self.file}: incumbent", error, f"numbers of shape {values.shape}")
         if others.dtype.kind not in "fiu":
             _fail(f"{self.file}: incumbent", others.dtype, "numbers")
         with np.errstate(all="ignore"):
-            total = others.astype(np.float32) + gains.astype(float) * values
+            total = others.astype(np.float32) + self.prior_cost.gain * values.astype(
+                float
+            )
             total = np.asarray(total).astype(np.float32)
         return self._finite("total", total, "finite values of the incumbent")
 
@@ -444,16 +385,9 @@ def _reward(file: str, sha256: str, body: dict[str, Any]) -> Reward:
         _fail("activation", body["activation"], f"one of {', '.join(ACTIVATIONS)}")
     prior = body["prior_cost"]
     if prior is not None:
-        low, high, familiarity = (prior[k] for k in ("low", "high", "familiarity"))
-        if low < 0.0:
-            _fail("prior_cost.low", low, "at least 0")
-        if high < low:
-            _fail("prior_cost.high", high, f"at least low, {_show(low)}")
-        spread = familiarity["scale"]
-        _every("prior_cost.familiarity.scale", spread, spread > 0.0, "over 0")
-        prior = PriorCost(
-            incumbent=prior["incumbent"], low=low, high=high, **familiarity
-        )
+        if prior["gain"] <= 0.0:
+            _fail("prior_cost.gain", prior["gain"], "above 0")
+        prior = PriorCost(**prior)
     _every("normaliser.lower", lower, lower <= upper, "at most upper")
     _every("normaliser.scale", scale, scale > 0.0, "over 0")
     _every("times", times[:1], times[:1] == 0.0, "0 s first")
@@ -487,10 +421,10 @@ def _plain(field: str, value: Any, depth: int) -> Any:  # noqa: ANN401
 
 
 def _verify(reward: Reward, samples: dict[str, Any]) -> None:
-    """Check that the file's samples score, and have gains, as the file says."""
-    features, valid, wanted, gains = samples.values()
+    """Check that the file's samples score as the file says."""
+    features, valid, wanted = samples.values()
     _every("samples.valid", valid, (valid == 0.0) | (valid == 1.0), "0 or 1")
-    if reward.scene_gating is not None or reward.prior_cost is not None:
+    if reward.scene_gating is not None:
         first = valid[:, :1]
         _every("samples.valid", first, first == 1.0, "1 at the first time")
     # One sample at a time: little memory, however wide the layers are.
@@ -499,14 +433,6 @@ def _verify(reward: Reward, samples: dict[str, Any]) -> None:
         if not abs(scored - want) <= TOLERANCE * max(1.0, abs(want)):
             need = f"{want:.9g} within {TOLERANCE:g} of max(1, |V|)"
             _fail(f"samples[{index}]", f"scored {scored:.9g}", need)
-    if (gains is None) != (reward.prior_cost is None):
-        given, need = ("given", "none without") if gains is not None else (None, "with")
-        _fail("samples.gain", given, f"{need} a prior cost")
-    if gains is not None and reward.prior_cost is not None:
-        with np.errstate(all="ignore"):
-            error = np.abs(reward.prior_cost.gain(features[:, 0]).astype(float) - gains)
-        good = error <= TOLERANCE * np.maximum(1.0, np.abs(gains))
-        _every("samples.gain", gains, good, "the gain of the sample")
 
 
 def _unpack(field: str, data: bytes) -> object:

@@ -93,7 +93,7 @@ def save_with_dial(
 
     Args:
       source: weights file with a prior cost.
-      dial: > 0, by which both ends of the gain are multiplied.
+      dial: > 0, by which the gain is multiplied.
       target: file to write.
 
     Returns:
@@ -123,7 +123,7 @@ def save_with_dial(
         )
         for name in ("features", "valid", "value")
     ]
-    turned = dataclasses.replace(prior, low=dial * prior.low, high=dial * prior.high)
+    turned = dataclasses.replace(prior, gain=dial * prior.gain)
     facts = {**reward.provenance, "dial": {"of_sha256": reward.sha256, "times": dial}}
     made = dataclasses.replace(reward, prior_cost=turned, provenance=facts)
     return save(target, made, *samples)
@@ -188,24 +188,15 @@ def _body(weights: reader.Reward, samples: tuple[np.ndarray, ...]) -> dict[str, 
             raise ValueError(f"provenance.{key}: missing: expected a value or None")
     columns = zip(weights.names, weights.units, weights.none_values, strict=True)
     layers = zip(weights.kernels, weights.biases, strict=True)
-    prior, gains = weights.prior_cost, None
-    if prior is not None:
-        arrays = {key: getattr(prior, key) for key in reader.FAMILIARITY}
-        try:
-            stored = {key: np.asarray(x, np.float32) for key, x in arrays.items()}
-            first = np.asarray(samples[0], np.float32)[:, 0]
-            gains = dataclasses.replace(prior, **stored).gain(first)
-        except (IndexError, TypeError, ValueError):
-            gains = np.zeros(1)  # what does not fit is named below, or by the reader
-        prior = {**vars(prior), "familiarity": arrays}
+    prior = weights.prior_cost
     row = lambda kind, values: dict(zip(kind[0], values, strict=True))  # noqa: E731
     body = {
         **vars(weights),
         "features": [row(reader.BODY["features"], column) for column in columns],
         "normaliser": vars(weights),
         "layers": [row(reader.BODY["layers"], layer) for layer in layers],
-        "prior_cost": prior,
-        "samples": row([reader.BODY["samples"]], (*samples, gains)),
+        "prior_cost": None if prior is None else vars(prior),
+        "samples": row([reader.BODY["samples"]], samples),
     }
     return _encoded("", body, reader.BODY)
 

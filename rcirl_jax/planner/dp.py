@@ -71,7 +71,6 @@ from rcirl_jax.planner.rank import (
 )
 from rcirl_jax.planner.safety import MOVING_MPS, SafetyConfig, check
 from rcirl_jax.reward import normalise
-from rcirl_jax.reward.familiarity import familiarity
 from rcirl_jax.reward.network import (
     ACTIVATIONS,
     feature_gates,
@@ -795,10 +794,8 @@ def dp_policy(
         nearest = jnp.argmax(jnp.where(admissible, scores, -jnp.inf))
         reference = jax.tree.map(lambda x: x[nearest], sampled.trajectory)
         on_path = along(scene, reference) if rank.steers else scene
-        x0 = features(scene, jax.tree.map(lambda x: x[0], sampled.trajectory))[0]
-        share = familiarity(params.familiarity, x0)
         objective = Objective(
-            gain=params.low + (params.high - params.low) * share,
+            gain=params.gain,
             reference=reference,
             own=own,
         )

@@ -7,12 +7,10 @@ and the tracking are the same for a learned, a hand-set and a random reward.
 A learned score added to the planner's own cost, with a gain for each scene.
 
     V = V_own + gain V_learned
-    gain = low + (high - low) familiarity      familiarity as in `reward.familiarity`
 
-A reward learned on some roads knows little of others. There the gain is `low`, and the
-learned value decides only between plans that the planner's own cost finds nearly equal.
-In traffic like the recorded traffic the gain is `high`. Gains are in units of the own
-cost per unit of V.
+A reward learned on some roads knows little of others: the larger the gain, the more it
+decides beyond plans that the planner's own cost finds nearly equal. The gain is in
+units of the own cost per unit of V, and the same in all scenes.
 """
 
 import dataclasses
@@ -28,7 +26,6 @@ from rcirl_jax.features import FeatureMap
 from rcirl_jax.planner.own_cost import OwnCost, own_cost
 from rcirl_jax.planner.plan import Plan, PreviousPlan, committed, either, plan_of
 from rcirl_jax.planner.safety import SafetyConfig, check, choose, last_resort
-from rcirl_jax.reward.familiarity import familiar_nowhere, familiarity
 from rcirl_jax.reward.hand import LatticeCost, lattice_costs
 from rcirl_jax.reward.network import (
     ACTIVATIONS,
@@ -41,7 +38,6 @@ from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.sampling.sampler import family_index
 from rcirl_jax.types import (
     Candidates,
-    Familiarity,
     Normaliser,
     RewardParams,
     Scene,
@@ -208,36 +204,29 @@ class Ranking(flax.struct.PyTreeNode, kw_only=True):
     """The score of candidates, V_own + gain V_learned; `ranking` makes it."""
 
     own: jax.Array  # [] place in OWN_SCORES; one beyond them: the user's own cost
-    low: jax.Array  # [] gain where nothing is known
-    high: jax.Array  # [] gain where all is
+    gain: jax.Array  # []
     reward: RewardParams  # effective
     normaliser: Normaliser
-    familiarity: Familiarity
 
 
 def ranking(
     weights: tuple[RewardParams, Normaliser],
     own: str = "constant V",
-    gains: tuple[float, float] = (1.0, 1.0),
-    known: Familiarity | None = None,
+    gain: float = 1.0,
 ) -> Ranking:
     """Names what ranks; all of one network's shape are valued by one program.
 
     Args:
       weights: effective parameters and normaliser of the learned reward.
       own: what it is added to: of OWN_SCORES, or the name of the user's own cost.
-      gains: low and high; (0, 0) leaves the learned reward out.
-      known: the familiarity, which matters where the gains differ.
+      gain: of the learned reward; 0 leaves it out.
     """
     params, normaliser = weights
-    low, high = (jnp.asarray(gain, jnp.float32) for gain in gains)
     return Ranking(
         own=jnp.asarray([*OWN_SCORES, own].index(own)),
-        low=low,
-        high=high,
+        gain=jnp.asarray(gain, jnp.float32),
         reward=params,
         normaliser=normaliser,
-        familiarity=known or familiar_nowhere(normaliser.scale.shape[0]),
     )
 
 
@@ -255,14 +244,12 @@ def ranking_score(
         rows = features.rows(scene, candidates)
         model = effective_model(params.reward, activation)
         values = value_rows(model, params.reward, params.normaliser, rows, scene)
-        x0 = jnp.stack([row[0, 0] for row in rows])
-        share = familiarity(params.familiarity, x0)
-        return (params.low + (params.high - params.low) * share) * values
+        return params.gain * values
 
     def score(params: Ranking, scene: Scene, candidates: Candidates) -> jax.Array:
         seen = scene, candidates
         own = jax.lax.switch(params.own, owns, None, *seen)
-        uses = (params.low != 0.0) | (params.high != 0.0)
+        uses = params.gain != 0.0
         nothing = lambda *_: jnp.zeros_like(own)  # noqa: E731
         return own + jax.lax.cond(uses, learned, nothing, params, *seen)
 

@@ -41,8 +41,6 @@ TERMS = {
     "prior cost": "the planner's own cost, to which the learned value is added",
     "dial": "one number that multiplies the gain of the learned value: at 0 the own "
     "cost drives alone, at 1 the candidate",
-    "familiarity": "how much a scene is like those recorded: the less, the smaller the "
-    "part of the learned value",
     "simulated demonstrations": "drives of the own cost in the simulator, which the "
     "training uses beside the recordings",
     "hand-set": "the cost with weights set by hand that planners drive with today",

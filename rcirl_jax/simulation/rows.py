@@ -170,7 +170,7 @@ def baseline_row(
         usual = RewardConfig().activation
         return learned_row(name, (drawn, weights[1]), preset, usual, config)
     row = learned_row(name, weights, preset, activation, config)
-    return dataclasses.replace(row, params=ranking(weights, name, (0.0, 0.0)))
+    return dataclasses.replace(row, params=ranking(weights, name, 0.0))
 
 
 def judges() -> tuple[Row, Row, Row, Row]:

@@ -2,9 +2,7 @@
 
 A reward tuned on some roads must not unlearn the others. So an expert may drive the
 catalogue (other seeds than the suite's). What is driven is a dataset like any other,
-with a weight of its own. Drives of weight 0 are not learned from: they show where a
-reward with a prior cost whose gain varies (`tuning.prior_cost`) has to leave the choice
-to that cost.
+with a weight of its own.
 """
 
 import dataclasses
@@ -30,7 +28,6 @@ from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
 from rcirl_jax.simulation.rows import baseline_row, drawn_weights, mobil_row
 from rcirl_jax.simulation.suite import suite_refs
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.tuning.prior_cost import fit_prior_cost
 from rcirl_jax.tuning.recipes import SimulatedDemonstrations
 from rcirl_jax.tuning.run import Run
 
@@ -87,11 +84,9 @@ def with_simulated(
     # a recorded source has the weight 1, whatever the shares add up to
     scale = len(sources) / sum(given)
     given = [share * scale for share in given]
-    recorded, drives = tuple(given), [] if plan.expert == "none" else [_drives(run)]
-    if drives and plan.weight > 0.0:
-        made += drives
+    if plan.expert != "none":
+        made.append(_drives(run))
         given.append(plan.weight)
-    fit_prior_cost(run, sources, recorded, drives)
     return as_one(made, given)
 
 

@@ -246,7 +246,7 @@ def _said_of_weights(run: Run) -> str:
 
 def rows_of(job: SuiteJob) -> int:
     """Counts who drives: rewards, baselines, the tuned IDM and two who judge."""
-    learned, planners = len(job.weights) + job.highest, len(job.planners)
+    learned, planners = len(job.weights), len(job.planners)
     return learned + planners + len(job.baselines) + 3
 
 
@@ -272,7 +272,7 @@ def work_of(
     settings, cases = dial_plan(job)
     some = len(cases) * job.duration_s + recorded  # s
     turned = 2.0 * some  # of `compare_choices`, then the settings of the dial
-    if config.prior_cost.wanted or config.train.residual_on:
+    if config.gain or config.train.residual_on:
         turned += (len(settings) - 2) * some
     return {
         "demonstrate": demonstrated,

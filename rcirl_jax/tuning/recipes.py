@@ -7,14 +7,15 @@
 
 [train] are fields of `TrainConfig`, [train.reward] of `RewardConfig` (`scene_gating`
 stands for the preset's context columns), [train.sampler] of `SamplerConfig`, [collect]
-of `CollectConfig`, [simulated_demonstrations] of `SimulatedDemonstrations`,
-[prior_cost] of `PriorCostConfig`. What a file leaves out is the field's own default.
-Nothing else has a default of its own: commands take a recipe, and flags given beside it
-win.
+of `CollectConfig`, [simulated_demonstrations] of `SimulatedDemonstrations`;
+[prior_cost] has the `gain` of V on top of the own cost. What a file leaves out is the
+field's own default. Nothing else has a default of its own: commands take a recipe, and
+flags given beside it win.
 """
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -54,7 +55,7 @@ class SimulatedDemonstrations:
     # s of a drive, and between two of its scenes
     duration_s: float = 120.0
     stride_s: float = 3.0
-    # where a recorded source has 1; 0: not learned from
+    # above 0, where a recorded source has 1
     weight: float = 1.2
 
     def __post_init__(self) -> None:
@@ -64,40 +65,11 @@ class SimulatedDemonstrations:
             ("expert", self.expert in EXPERTS, f"one of {', '.join(EXPERTS)}"),
             ("cases", self.cases >= 1, "at least 1"),
             ("catalogue_seed", self.catalogue_seed > SUITE_SEED, above),
-            ("weight", self.weight >= 0.0, ">= 0"),
+            ("weight", self.weight > 0.0, "above 0"),
         ):
             if not fits:
                 value = getattr(self, name)
                 raise InputError(f"{name}: {value}: expected {expected}")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PriorCostConfig:
-    """[prior_cost] of a recipe; gains of V on top of the own cost."""
-
-    # where nothing like the scene was recorded, and where all of it was: one number
-    # twice is the gain everywhere; 0: no prior cost, V drives alone
-    low: float = 0.0
-    high: float = 0.0
-    # shares of the ego's speed at which the simulated scenes are shown once more: who
-    # is slow on an empty road is not in recorded traffic for being slow
-    slowed: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        """0 <= low <= high, and 0 <= slowed < 1."""
-        if not 0.0 <= self.low <= self.high:
-            both = f"{self.low}, {self.high}"
-            raise InputError(f"low, high: {both}: expected 0 <= low <= high")
-        if not all(0.0 <= share < 1.0 for share in self.slowed):
-            raise InputError(
-                f"slowed: {list(self.slowed)}: expected shares of the speed, each at "
-                "least 0 and below 1"
-            )
-
-    @property
-    def wanted(self) -> bool:
-        """True if there is a prior cost."""
-        return self.high > 0.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,7 +81,7 @@ class Recipe:
     train: TrainConfig
     collect: CollectConfig
     simulated: SimulatedDemonstrations
-    prior_cost: PriorCostConfig
+    gain: float  # of V on top of the own cost; 0: V drives alone
     seeds: int  # training runs of which the median one drives
 
 
@@ -164,7 +136,10 @@ def load_recipe(name: str) -> Recipe:
         simulated = typed_settings(SimulatedDemonstrations, found, where)
     with _inside(path, "prior_cost") as where:
         found = _table(path, "prior_cost", body)
-        prior_cost = typed_settings(PriorCostConfig, found, where)
+        check_names(where, found, ("gain",))
+        gain = found.get("gain", 0.0)
+        if type(gain) not in (int, float) or not 0.0 <= gain < math.inf:
+            raise InputError(f"gain: {gain}: expected a number, at least 0")
     with _inside(path, "collect") as where:
         found = _table(path, "collect", body)
         kept = typed_fields(CollectConfig, found, where, ("signal_checks",))
@@ -174,20 +149,14 @@ def load_recipe(name: str) -> Recipe:
     seeds = tuned.get("seeds", 1)
     if type(seeds) is not int or seeds < 1:
         raise InputError(f"{path}: [autotune] seeds: {seeds}: expected at least 1")
-    if prior_cost.low < prior_cost.high and simulated.expert == "none":
-        raise InputError(
-            f"{path}: [{SIMULATED}] expert: none: expected one where the gain of "
-            "[prior_cost] varies: its drives show what was not recorded"
-        )
     if trained.residual_on:
         where = f"{path}: [train] residual_on: {trained.residual_on}"
         if trained.residual_on != "own cost":
             raise InputError(f'{where}: expected "own cost", the incumbent\'s')
-        nobody = simulated.expert == "none" or not simulated.weight
-        if prior_cost.wanted or nobody:
+        if gain or simulated.expert == "none":
             raise InputError(
-                f"{where}: expected no [prior_cost], and [{SIMULATED}] with a weight "
-                "above 0: they show where nobody was recorded"
+                f"{where}: expected no [prior_cost], and [{SIMULATED}]: they show "
+                "where nobody was recorded"
             )
     return Recipe(
         name=path.stem if name in known else name,
@@ -195,7 +164,7 @@ def load_recipe(name: str) -> Recipe:
         train=trained,
         collect=collect,
         simulated=simulated,
-        prior_cost=prior_cost,
+        gain=float(gain),
         seeds=seeds,
     )
 

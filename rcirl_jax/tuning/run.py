@@ -2,7 +2,7 @@
 
 RUN/dataset-KEY/       the import of each log, unless datasets are given
 RUN/demonstrations-KEY/ simulated: the expert's drives
-RUN/prior_cost.json    gains, and how far the recordings reach
+RUN/prior_cost.json    the own cost, and the gain of V on top of it
 RUN/train-KEY/seed-N/  training runs; KEY changes with what they are made from
 RUN/seeds/N.msgpack    every seed's reward
 RUN/weights.msgpack    the candidate: of the seeds the one with the median share of
@@ -44,7 +44,7 @@ from rcirl_jax.runtime.pipeline import Stages, code_sha256, file_sha256
 from rcirl_jax.simulation.rows import KNOWN_BASELINES
 from rcirl_jax.train.loop import Running
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.tuning.recipes import PriorCostConfig, SimulatedDemonstrations
+from rcirl_jax.tuning.recipes import SimulatedDemonstrations
 
 # what reads as permission to use weights that are no longer there
 JUDGED = ("gate", "dial", "decided", "report")
@@ -73,7 +73,7 @@ class TuneConfig:
     simulated: SimulatedDemonstrations = dataclasses.field(
         default_factory=SimulatedDemonstrations
     )
-    prior_cost: PriorCostConfig = dataclasses.field(default_factory=PriorCostConfig)
+    gain: float = 0.0  # of V on top of the own cost; 0: V drives alone
     data_weights: str = EQUAL  # of several sources, as `data.store.dataset.shares_of`
     recipe: str = ""  # its name, for the report
     seeds: int = 1

@@ -62,6 +62,7 @@ from rcirl_jax.train.metrics import pairs_won
 from rcirl_jax.train.state import FUTURES
 from rcirl_jax.tuning.prior_cost import (
     OWN_COST,
+    make_prior_cost,
     on_own_cost,
     prior_cost_file,
     read_prior_cost,
@@ -89,6 +90,7 @@ def train_seeds(run: Run, dataset: Demonstrations, sources: Sequence[Dataset]) -
       sources: of it, what was recorded.
     """
     files = run.seed_files
+    make_prior_cost(run, sources)
     prior = prior_cost_file(run)
     run = on_own_cost(run, sources)
     for number, file in enumerate(files):
@@ -489,7 +491,7 @@ def turn_dial(run: Run, sources: Sequence[Dataset]) -> None:
         rows = [
             {
                 "dial": x,
-                "gain": [x * prior.low, x * prior.high],
+                "gain": x * prior.gain,
                 "file": str(names[x].relative_to(run.folder)) if x in names else None,
                 "measures": found[x],
             }

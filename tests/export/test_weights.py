@@ -30,7 +30,6 @@ from rcirl_jax.runtime.specs import spec_root
 from tests.export.wrong import body_of
 from tests.helpers.weights_files import (
     ACTIVATIONS,
-    example_prior_cost,
     example_samples,
     example_weights,
     loop_value,
@@ -98,12 +97,7 @@ def test_everything_comes_back_as_it_was_given():
     assert (reward.preset, reward.loss) == ("test", weights.loss)
     assert reward.provenance == provenance()
     assert type(reward.provenance["metrics"]["steps"]) is int
-    made, found = weights.prior_cost, reward.prior_cost
-    assert made is not None
-    assert found is not None
-    assert_back(found, made, tuple(reader.FAMILIARITY))
-    for name in ("incumbent", "low", "high"):
-        assert getattr(found, name) == getattr(made, name)
+    assert reward.prior_cost == weights.prior_cost
     assert decode_weights(packed()).prior_cost is None
 
 
@@ -137,11 +131,10 @@ def test_layout_is_the_documented_one():
     assert outer["sha256"] == hashlib.sha256(outer["body"]).hexdigest()
     body = msgpack.unpackb(outer["body"])
     assert tuple(body) == tuple(reader.BODY)
-    assert body["scene_gating"] is body["prior_cost"] is body["samples"]["gain"] is None
+    assert body["scene_gating"] is body["prior_cost"] is None
     full = body_of(packed(with_prior=True, scene_gating=True))
     assert full["scene_gating"]["shape"] == [3, 3]
     assert tuple(full["prior_cost"]) == tuple(reader.BODY["prior_cost"][0])
-    assert tuple(full["prior_cost"]["familiarity"]) == tuple(reader.FAMILIARITY)
 
 
 @pytest.mark.parametrize("scene_gating", [False, True])
@@ -192,7 +185,6 @@ def test_schema_describes_the_body_and_refuses_others():
         (schema, tuple(reader.BODY)),
         (found["samples"], reader.BODY["samples"]),
         (prior, reader.BODY["prior_cost"][0]),
-        (prior["properties"]["familiarity"], reader.FAMILIARITY),
     ):
         assert (
             tuple(described["required"])
@@ -215,15 +207,15 @@ GOLDEN = Path(__file__).parent / "golden" / "weights.msgpack"
 def golden():
     """The file, inputs, masks, and what it scored and added when it was written."""
     told = json.loads(GOLDEN.with_suffix(".json").read_text())
-    names = ("features", "time_valid", "value", "gain", "incumbent", "total")
+    names = ("features", "time_valid", "value", "incumbent", "total")
     return GOLDEN, *(np.array(told[name]) for name in names)
 
 
 def test_a_file_that_planners_have_scores_as_it_did():
     """Never made anew: a reader that fails here would strand the weights in use."""
-    path, features, valid, value, gain, own, total = golden()
+    path, features, valid, value, own, total = golden()
     assert hashlib.sha256(path.read_bytes()).hexdigest() == (
-        "724ac3da0a02aadcbdeac52afc10534b4cd81f267214f1ef83ba8e4c77b702f9"
+        "90b0830b2708e64472938804e3ca1becf9824c4350e59118130291cb9783459f"
     )
     reward = load_weights(path)
     assert reward.names == ("feature0", "feature1", "feature2", "feature3")
@@ -231,12 +223,11 @@ def test_a_file_that_planners_have_scores_as_it_did():
     close = {"rtol": 1e-6, "atol": 1e-6}
     assert np.ptp(value) > 1.0
     np.testing.assert_allclose(reward.value(features, valid), value, **close)
-    np.testing.assert_allclose(reward.gain(features), gain, **close)
     np.testing.assert_allclose(reward.total(features, own, valid), total, **close)
 
 
-def prior(**changes):
-    return {"prior_cost": dataclasses.replace(example_prior_cost(), **changes)}
+def prior(gain):
+    return {"prior_cost": reader.PriorCost(incumbent="hand-set", gain=gain)}
 
 
 ENDLESS: dict = {}
@@ -250,13 +241,11 @@ ENDLESS["self"] = ENDLESS
         ({"scale": np.array([1.0, 0.0, 1.0])}, "normaliser.scale[1]: 0: expected over"),
         ({"gamma": np.array([1.0, 1.0, 1e39, 1.0])}, "gamma[2]: inf: expected finite"),
         ({"preset": 3}, "preset: 3: expected a text"),
-        (prior(high=0.1), "prior_cost.high: 0.1: expected at least low, 0.25"),
-        (prior(out=np.ones(3)), "prior_cost.familiarity.out.shape: [3]: expected [4]"),
-        (prior(high=1e300), "samples.gain[0]: inf: expected finite numbers"),
+        (prior(0.0), "prior_cost.gain: 0: expected above 0"),
+        (prior(math.inf), "prior_cost.gain: inf: expected a finite number"),
         # what never becomes a file
         ({"preset": object()}, "can not serialize"),
         ({"gamma": "many"}, "gamma: could not convert string to float"),
-        (prior(bias="many"), "prior_cost.familiarity.bias: could not convert string"),
         ({"gamma": [[1.0], [1.0, 2.0]]}, "gamma: setting an array element"),
         ({"biases": ()}, "biases: 0 biases: expected one for each kernel"),
         ({"provenance": {}}, "provenance.dataset_sha256: missing: expected a value"),
@@ -283,7 +272,7 @@ def test_what_a_reader_would_refuse_is_never_written(changes, message, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_prior_cost_needs_samples_that_fit():
+def test_samples_have_to_fit():
     weights = example_weights(with_prior=True)
     features, valid, values = example_samples(weights)
     for wrong in (features[:, :, :2], features[:0], features[:, :0], features[0]):
@@ -298,8 +287,7 @@ def test_a_dial_multiplies_the_gain_and_nothing_else(tmp_path):
     samples = example_samples(weights)
     was = save(tmp_path / "was", weights, *samples)
     now = save_with_dial(tmp_path / "was", 2.5, tmp_path / "now")
-    assert (now.prior_cost.low, now.prior_cost.high) == (0.625, 3.75)
-    np.testing.assert_allclose(now.gain(samples[0]), 2.5 * was.gain(samples[0]))
+    assert now.prior_cost.gain == 3.75
     np.testing.assert_array_equal(now.value(samples[0]), was.value(samples[0]))
     assert now.provenance["dial"] == {"of_sha256": was.sha256, "times": 2.5}
     with pytest.raises(InputError, match="dial: 0: expected above 0"):

@@ -14,6 +14,7 @@ from tests.helpers.weights_files import packed
 
 VALID = packed()
 WITH_PRIOR = packed(with_prior=True)
+GATED = packed(scene_gating=True)
 
 
 def dump(value) -> bytes:
@@ -56,30 +57,13 @@ def flipped(data, bits):
     return bytes(changed)
 
 
-FAMILIARITY_FIELDS = (
-    (["location"], array(2), "location.shape: [2]: expected [3]"),
-    (["location"], array(3, fill=np.inf), "location[0]: inf: expected fin"),
-    (["scale"], array(3, fill=0.0), "scale[0]: 0: expected over 0"),
-    (["kernel"], array(4, 3), "kernel.shape: [4, 3]: expected [3, "),
-    (["kernel"], array(3, 5), "bias.shape: [4]: expected [5]"),
-    (["out"], array(1), "out.shape: [1]: expected [4]"),
-    (["offset"], array(2), "offset.shape: [2]: expected [1]"),
-    (["extra"], 1, "extra: unknown: expected the keys location, scale"),
-)
 PRIOR_COST_FIELDS = (
-    ([], {}, "prior_cost.incumbent: missing: expected the keys incumbent, low, high"),
-    (["extra"], 1, "prior_cost.extra: unknown: expected the keys incumbent, low"),
+    ([], {}, "prior_cost.incumbent: missing: expected the keys incumbent, gain"),
+    (["extra"], 1, "prior_cost.extra: unknown: expected the keys incumbent, gain"),
     (["incumbent"], 5, "prior_cost.incumbent: 5: expected a text"),
-    (["low"], -0.5, "prior_cost.low: -0.5: expected at least 0"),
-    (["low"], 2, "prior_cost.high: 1.5: expected at least low, 2"),
-    (["low"], 0.2, "samples.gain[0]: "),
-    (["high"], 1e300, "samples.gain[0]: "),
-    (["familiarity", "out"], array(4, fill=3e38), "samples.gain["),
-    (["familiarity", "offset"], array(1, fill=9.0), "samples.gain["),
-    *(
-        (["familiarity", *path], value, f"prior_cost.familiarity.{line}")
-        for path, value, line in FAMILIARITY_FIELDS
-    ),
+    (["gain"], -0.5, "prior_cost.gain: -0.5: expected above 0"),
+    (["gain"], 0, "prior_cost.gain: 0: expected above 0"),
+    (["gain"], "1", "prior_cost.gain: 1: expected a finite number"),
 )
 FIELDS = (
     (["preset"], 5, "preset: 5: expected a text"),
@@ -124,13 +108,12 @@ FIELDS = (
     (["extra"], 1, "body.extra: unknown: expected the keys preset"),
     (["training_range"], array(1, 3), "training_range.shape: [1, 3]: expected [2, 3]"),
     (["scene_gating"], array(1, 2), "scene_gating.shape: [1, 2]: expected [3, 3]"),
-    (["samples", "gain"], array(4), "samples.gain: given: expected none without"),
+    (["samples", "gain"], array(4), "samples.gain: unknown: expected the keys"),
     *((["prior_cost", *path], value, line) for path, value, line in PRIOR_COST_FIELDS),
 )
 
 
 LATER = "schema_version: 2: expected 1, all this reader supports"
-GAIN = ["samples", "gain"]
 FILES = (
     (b"", "size: 0 bytes or more: expected 1 to 67108864 bytes"),
     (VALID[:-1], "file: ValueError Unpack failed: incomplete input: expected one"),
@@ -150,14 +133,8 @@ FILES = (
         tampered(["training_range", "data"], np.arange(6, 0, -1, "<f4").tobytes()),
         "training_range[0, 0]: 6: expected at most the highest",
     ),
-    (tampered(GAIN, array(3), WITH_PRIOR), "samples.gain.shape: [3]: expected [4]"),
-    (tampered(GAIN, array(4, fill=9.0), WITH_PRIOR), "samples.gain[0]: 9: expected"),
     (
-        tampered(GAIN, None, WITH_PRIOR),
-        "samples.gain: None: expected with a",
-    ),
-    (
-        tampered(["samples", "valid"], array(4, 4, fill=0.0), WITH_PRIOR),
+        tampered(["samples", "valid"], array(4, 4, fill=0.0), GATED),
         "samples.valid[0, 0]: 0: expected 1 at the first time",
     ),
     (sealed(body_of(), schema_version=True), "schema_version: True: expected 1, all"),

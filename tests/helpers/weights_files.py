@@ -1,7 +1,6 @@
 """Weights and weights files for tests: made up, random, as training leaves them."""
 
 import dataclasses
-import math
 from itertools import pairwise
 
 import jax
@@ -58,7 +57,7 @@ def example_weights(
         training_range=np.sort(
             np.random.default_rng(seed).normal(size=(2, features)), axis=0
         ),
-        prior_cost=example_prior_cost(seed, features) if with_prior else None,
+        prior_cost=PriorCost(incumbent="hand-set", gain=1.5) if with_prior else None,
         kernels=tuple(draw(*pair) for pair in pairwise(sizes)),
         biases=tuple(draw(size) for size in sizes[1:]),
         activation=activation,
@@ -68,26 +67,13 @@ def example_weights(
     )
 
 
-def example_prior_cost(seed=0, features=3, units=4):
-    """Its first feature does not matter, if there is another."""
-    rng = np.random.default_rng(seed)
-    draw = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
-    kernel = draw(features, units)
-    kernel[: features - 1 and 1] = 0.0
-    return PriorCost(
-        incumbent="hand-set", low=0.25, high=1.5, location=draw(features),
-        scale=0.2 + rng.random(features, np.float32), kernel=kernel,
-        bias=draw(units), out=draw(units), offset=draw(1),
-    )  # fmt: skip
-
-
 def example_samples(weights, count=4, seed=1):
     """Features that often leave [lower, upper], masks, float64 values."""
     rng = np.random.default_rng(seed)
     size = (count, len(weights.times), len(weights.names))
     features = rng.normal(scale=2.0, size=size).astype(np.float32)
     valid = rng.random(size[:2]) < 0.7
-    valid[:, 0] |= weights.scene_gating is not None or weights.prior_cost is not None
+    valid[:, 0] |= weights.scene_gating is not None
     values = [loop_value(weights, *one) for one in zip(features, valid, strict=True)]
     return features, valid, np.array(values)
 
@@ -126,21 +112,6 @@ def loop_value(weights, features, valid):
             x = x if layer == last else act(x)
         total += float(weights.gamma[t]) * x[0]
     return total
-
-
-def loop_gain(prior_cost, first):
-    """The gain of V in float64; `first` is [F]."""
-    z = np.clip(
-        (np.asarray(first, np.float64) - prior_cost.location) / prior_cost.scale,
-        -5.0,
-        5.0,
-    )
-    x = np.tanh(
-        z @ np.asarray(prior_cost.kernel, np.float64) + prior_cost.bias
-    ) @ np.asarray(prior_cost.out, np.float64)
-    return prior_cost.low + (prior_cost.high - prior_cost.low) / (
-        1.0 + math.exp(-x - prior_cost.offset[0])
-    )
 
 
 SPECS = feature_map("paper21").specs

@@ -196,7 +196,7 @@ def test_walls_and_bodies_are_not_entered():
 def total(made, trajectory, w, own, gain):
     """V_own + gain V of one trajectory, as the planner values it."""
     one = as_candidates(trajectory)
-    params = ranking(w, own, (gain, gain))
+    params = ranking(w, own, gain)
     return float(RANKED(params, made, one)[0])
 
 
@@ -290,7 +290,7 @@ def test_search_finds_better_plans_than_the_sampler():
     @jax.jit
     def best(made, w):
         sampled = sample(jax.random.key(0), made, ONLINE)
-        params = ranking(w, "hand-set", (0.0, 0.0))
+        params = ranking(w, "hand-set", 0.0)
         of = lambda x: jnp.where(  # noqa: E731
             check(made, x).admissible, RANKED(params, made, x), -jnp.inf
         )

@@ -52,9 +52,7 @@ def test_a_table_is_two_programs():
     """One for whatever ranks candidates, one for all driver models and the judges."""
     weights, config = untrained(), RankConfig()
     learned = learned_row("learned", weights, "paper21", "tanh", config)
-    gained = dataclasses.replace(
-        learned, params=ranking(weights, "hand-set", (0.3, 2.0))
-    )
+    gained = dataclasses.replace(learned, params=ranking(weights, "hand-set", 2.0))
     rows = [learned, gained, *judges(), rule_row("slow", "IDM", CAREFUL)]
     rows += [baseline_row(name, "paper21", weights, config) for name in BASELINES]
     with compiles("jit(run)") as made:

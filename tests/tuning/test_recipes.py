@@ -69,8 +69,8 @@ def test_the_papers_own_setting():
         ),
         ("[collect]\nstride = 1.0", r"stride: unknown: .*did you mean stride_s\?"),
         (
-            "[prior_cost]\nslowed = [1.0]",
-            r"slowed: \[1.0\]: expected shares of the speed",
+            "[prior_cost]\ngain = -1.0",
+            "gain: -1.0: expected a number, at least 0",
         ),
         ("train = 3", r"train: 3: expected a table"),
     ],

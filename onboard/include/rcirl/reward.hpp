@@ -103,18 +103,15 @@ class Reward {
 
   // Whether V is made to be added to the value of an incumbent, and of which one.
   bool has_prior_cost() const { return !incumbent().empty(); }
-  const std::string& incumbent() const { return weights_.prior_cost.incumbent; }
-  double lowest_gain() const { return weights_.prior_cost.low; }    // where nothing is familiar
-  double highest_gain() const { return weights_.prior_cost.high; }  // where all is
+  const std::string& incumbent() const { return weights_.incumbent; }
+  double gain() const { return weights_.gain; }  // above 0; 0 without a prior cost
 
   // V_incumbent + gain V of trajectories, with a prior cost; higher is better.
   //
   //   incumbent  [K] its values (a cost, negated); may be the same memory as `values`
   //
-  // The rest as `score`, which refuses the same candidates. Refused are also those with
-  // a first time that is not valid, without a finite gain (a NaN at the first time among
-  // the features that matter to it) or a finite value of the incumbent, and all
-  // candidates of a reward without a prior cost.
+  // The rest as `score`, which refuses the same candidates. Refused are also those without
+  // a finite value of the incumbent, and all candidates of a reward without a prior cost.
   std::size_t total(const float* features, std::size_t count, Mask valid,
                     const float* incumbent, Workspace* workspace,
                     float* values) const noexcept;
@@ -189,8 +186,7 @@ inline std::string describe(const Reward& reward) {
     without += (without.empty() ? "" : ", ") + name;
   }
   if (reward.has_prior_cost()) {
-    prior = reward.incumbent() + ", gain " + detail::number_text(reward.lowest_gain()) + " to " +
-            detail::number_text(reward.highest_gain());
+    prior = reward.incumbent() + ", gain " + detail::number_text(reward.gain());
   }
   if (!reward.times().empty()) {
     last = detail::number_text(static_cast<double>(reward.times().back()));
@@ -249,24 +245,17 @@ inline std::size_t Reward::total(const float* features, std::size_t count, Mask 
   std::size_t refused = 0;
   for (std::size_t first = 0; first < count; first += detail::kLanes) {
     const std::size_t lanes = std::min(detail::kLanes, count - first);
-    const float* block = features + first * row;
-    float own[detail::kLanes], gain = 0.0f;
+    float own[detail::kLanes];
     std::copy(incumbent + first, incumbent + first + lanes, own);
     Mask marks = valid;
     if (valid.data != nullptr) marks.data += first * stride;
-    score(block, lanes, marks, workspace, values + first);
+    score(features + first * row, lanes, marks, workspace, values + first);
     for (std::size_t k = 0; k < lanes; ++k) {
-      const float* x = block + k * row;
-      // candidates of one scene begin alike
-      const bool same = k > 0 && std::memcmp(x, x - row, network.features * sizeof *x) == 0;
-      if (!same) gain = detail::gain(weights_.prior_cost, x);
       float& value = values[first + k];
-      const double sum = static_cast<double>(own[k]) +
-                         static_cast<double>(gain) * static_cast<double>(value);
-      const bool starts = marks.data == nullptr || marks.data[k * stride] == 1;
+      const double sum = static_cast<double>(own[k]) + gain() * static_cast<double>(value);
       const bool finite = std::abs(sum) <= double{std::numeric_limits<float>::max()};
-      value = starts && finite ? static_cast<float>(sum) : kNone;
-      refused += std::isinf(value);
+      value = finite ? static_cast<float>(sum) : kNone;
+      refused += !finite;
     }
   }
   return refused;

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.evaluation.gate.types import (
-    AT_HIGHEST,
     CANDIDATE,
     INCUMBENT,
     Check,
@@ -70,7 +69,7 @@ def _nearer_driver(pair: Pair) -> Iterator[str]:
     apart = {
         name: over_clusters(mine, other, clusters)
         for name, other in known.distance.items()
-        if name not in (CANDIDATE, AT_HIGHEST)
+        if name != CANDIDATE
     }
     behind = {name: d for name, d in apart.items() if d.high >= 0.0}
     if not behind:
@@ -90,7 +89,6 @@ def _higher_score(pair: Pair) -> Iterator[str]:
     scores = {
         name: np.asarray(nuplan_score(row, way)[0], np.float64)
         for name, row in runs.rows.items()
-        if name != AT_HIGHEST
     }
     best = max(scores, key=lambda name: scores[name].mean())
     if scores[best].mean() <= scores[pair.mine].mean() or np.unique(clusters).size < 2:

@@ -34,9 +34,6 @@ EXIT_CODES: dict[Decision, int] = {
     "could not judge": 2,
 }
 CANDIDATE, INCUMBENT = "candidate", "incumbent"  # names of rows
-# the candidate where all scenes are as familiar as any: what drives on roads like the
-# recorded ones
-AT_HIGHEST = "candidate, highest gain"
 MAX_ACCEPTED = 3  # cases; more than a person looks at are no exceptions
 IMPACT_MPS = 10.0  # m/s at which an at-fault impact counts as one
 FELT = ("rms_a", "rms_j")  # fields of CaseMetrics: comfort, of which less is better

@@ -12,8 +12,6 @@ Six kinds of check, none of them on a learned reward:
     no loss     rates, impact speeds and progress over all cases are not worse than the
                 incumbent's by more than a margin: the lower end of the paired 95 %
                 interval over cases lies above it
-                Both again at the highest gain everywhere, if the candidate's gain
-                varies by scene (`_at_highest`)
     families    in no family more clean drives or progress are lost than a margin. All
                 families have to show it, so none is adjusted; a loss is detected
                 (exact McNemar, t) only after Holm over families
@@ -51,7 +49,6 @@ from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, SuiteResult
 from rcirl_jax.evaluation.closed_loop.summary import result_hash
 from rcirl_jax.evaluation.gate.against import against
 from rcirl_jax.evaluation.gate.types import (
-    AT_HIGHEST,
     CANDIDATE,
     FELT,
     IMPACT_MPS,
@@ -146,7 +143,6 @@ def judge(pair: Pair, config: GateConfig, part: str = "") -> Verdict:
         *_no_more("safety", pair, pair.incumbent, config),
         *_recorded(pair, config),
         *_no_loss(pair, config),
-        *_at_highest(pair, config),
         *_families(pair, config),
         *_trivial_baselines(pair, config),
         _likeness(pair, config),
@@ -473,22 +469,6 @@ def _recorded(pair: Pair, config: GateConfig) -> Iterator[Check]:
     passes = found.low > -margin
     fails = bool(found.high < 0.0 and not passes)
     yield _check(kind, name, WORDS[name].title, found, fails, passes, margin=margin)
-
-
-def _at_highest(pair: Pair, config: GateConfig) -> Iterator[Check]:
-    """Repeats safety and no loss for the candidate at its highest gain everywhere.
-
-    A gain by familiarity is low in most of the suite and high on roads like the
-    recorded ones: what drives there is hardly driven by the suite.
-    """
-    if AT_HIGHEST not in pair.runs.rows:
-        return
-    highest = dataclasses.replace(pair, mine=AT_HIGHEST)
-    same = _no_more("safety", highest, highest.incumbent, config)
-    for check in (*same, *_no_loss(highest, config)):
-        title = f"{check.title}, at the highest gain everywhere"
-        name = f"{check.name}, highest gain"
-        yield dataclasses.replace(check, name=name, title=title)
 
 
 def _families(pair: Pair, config: GateConfig) -> Iterator[Check]:

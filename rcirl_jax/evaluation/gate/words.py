@@ -249,8 +249,7 @@ def _worse(check: Check, pair: Pair, crawling: bool) -> str:
         return f"is not {check.title}"
     family = family_of(check)
     if not family:
-        said = words_of(check).worse.format(**_numbers(check))
-        return said + (", at its highest gain" if ", " in check.name else "")
+        return words_of(check).worse.format(**_numbers(check))
     title, at = family_title(family), np.asarray(pair.runs.groups) == family
     where = f'in "{title[:1].lower()}{title[1:]}"'
     if check.lost is not None:

@@ -14,7 +14,6 @@
 #include "rcirl/detail/checks.hpp"
 #include "rcirl/detail/limits.hpp"
 #include "rcirl/detail/network.hpp"
-#include "rcirl/detail/prior_cost.hpp"
 #include "rcirl/detail/sha256.hpp"
 #include "rcirl/detail/tree.hpp"
 
@@ -36,7 +35,8 @@ struct Weights {
   std::vector<Feature> features;      // [F]
   std::vector<float> times;           // [T] s
   std::vector<float> training_range;  // [2, F] ends of the training's range
-  PriorCost prior_cost;               // or empty
+  std::string incumbent;              // whose value V is added to; empty: none
+  double gain = 0.0;                  // of V on top of it, above 0
   Network network;
 };
 
@@ -142,6 +142,14 @@ inline bool decode_layers(Checks& is, const Node& node, Network* network) {
                                std::to_string(width), "1 output, the reward");
 }
 
+inline bool decode_prior_cost(Checks& is, const Node& node, Weights* weights) {
+  Values row;
+  return is.map("prior_cost", node, {"incumbent", "gain"}, &row) &&
+         is.text("prior_cost.incumbent", *row[0], &weights->incumbent) &&
+         is.number("prior_cost.gain", *row[1], &weights->gain) &&
+         (weights->gain > 0.0 || is.fail("prior_cost.gain", *row[1], "above 0"));
+}
+
 inline bool decode_loss(Checks& is, const Node& node) {
   Values loss;
   std::string name;
@@ -151,13 +159,11 @@ inline bool decode_loss(Checks& is, const Node& node) {
          (loss[1]->kind == Kind::kNil || is.number("loss.leaky_rate", *loss[1], &rate));
 }
 
-// The file's own samples must score, and have gains, as the file says.
-inline bool verify(Checks& is, const Node& node, const Weights& weights) {
-  const Network& network = weights.network;
-  const bool added = !weights.prior_cost.incumbent.empty();
+// The file's own samples must score as the file says.
+inline bool verify(Checks& is, const Node& node, const Network& network) {
   Values found;
-  Array value, features, valid, gains;
-  if (!(is.map("samples", node, {"features", "valid", "value", "gain"}, &found) &&
+  Array value, features, valid;
+  if (!(is.map("samples", node, {"features", "valid", "value"}, &found) &&
         is.array("samples.value", *found[2], {{1, kMaxSamples}}, &value))) {
     return false;
   }
@@ -169,7 +175,7 @@ inline bool verify(Checks& is, const Node& node, const Weights& weights) {
         }))) {
     return false;
   }
-  if ((added || !network.scene_gating.empty()) &&
+  if (!network.scene_gating.empty() &&
       !is.every("samples.valid", valid, "1 at the first time",
                 [&](float v, std::size_t i) { return i % times != 0 || v > 0.0f; })) {
     return false;
@@ -179,28 +185,15 @@ inline bool verify(Checks& is, const Node& node, const Weights& weights) {
   std::vector<float> scored(count);
   score(network, features.values.data(), count, {marks.data(), times}, work.data(),
         scored.data());
-  const auto near = [](double got, double want) {
-    return std::abs(got - want) <= kTolerance * std::max(1.0, std::abs(want));
-  };
   for (std::size_t i = 0; i < count; ++i) {
     const double want = static_cast<double>(value.values[i]);
     const double got = static_cast<double>(scored[i]);
-    if (!near(got, want)) {
+    if (!(std::abs(got - want) <= kTolerance * std::max(1.0, std::abs(want)))) {
       return is.fail(index_text("samples", i), "scored " + number_text(got),
                      number_text(want) + " within 1e-05 of max(1, |V|)");
     }
   }
-  if (!added) {
-    return found[3]->kind == Kind::kNil ||
-           is.fail("samples.gain", *found[3], "none without a prior cost");
-  }
-  const std::size_t row = times * network.features;
-  return is.array("samples.gain", *found[3], {count}, &gains) &&
-         is.every("samples.gain", gains, "the gain of the sample",
-                  [&](float want, std::size_t i) {
-                    const float got = gain(weights.prior_cost, &features.values[i * row]);
-                    return near(static_cast<double>(got), static_cast<double>(want));
-                  });
+  return true;
 }
 
 inline bool decode_seen(Checks& is, const Node& node, std::size_t features, Array* seen) {
@@ -235,7 +228,7 @@ inline bool decode_body(Checks& is, const Node& root, Weights* weights) {
         is.array("gamma", *body[5], {weights->times.size()}, &gamma) &&
         decode_layers(is, *body[6], &network) &&
         is.number("leaky_slope", *body[8], &slope) &&
-        (!added || decode_prior_cost(is, *body[10], size, &weights->prior_cost)) &&
+        (!added || decode_prior_cost(is, *body[10], weights)) &&
         is.plain("provenance", *body[12], kMaxDepth))) {
     return false;
   }
@@ -246,7 +239,7 @@ inline bool decode_body(Checks& is, const Node& root, Weights* weights) {
   network.scene_gating = std::move(scene_gating.values);
   network.gamma = std::move(gamma.values);
   network.leaky_slope = narrow(slope);
-  return verify(is, *body[13], *weights);
+  return verify(is, *body[13], network);
 }
 
 inline bool decode_outer(Checks& is, const Node& root, Weights* weights,

@@ -8,8 +8,7 @@
 namespace rcirl::detail {
 
 constexpr char kMagic[] = "RCIRLW";
-constexpr double kTolerance = 1e-5;  // of max(1, |V|), on a verification sample; of gains too
-constexpr double kReach = 5.0;  // scales beyond which the familiarity's inputs are clipped
+constexpr double kTolerance = 1e-5;  // of max(1, |V|), on a verification sample
 
 constexpr std::size_t kMaxFileBytes = 64u << 20;
 constexpr std::uint32_t kMaxFeatures = 64;   // F

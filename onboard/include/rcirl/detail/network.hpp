@@ -54,7 +54,7 @@ struct Network {
     return most;
   }
 
-  // Lanes that `score` works in: the inputs and outputs of a layer, and the gains.
+  // Lanes that `score` works in: the inputs and outputs of a layer, and the gates.
   std::size_t work_size() const { return 2 * width() + (scene_gating.empty() ? 0 : features); }
 };
 
@@ -161,8 +161,8 @@ inline void normalise(const Network& network, const float* const* rows, Lanes* x
   }
 }
 
-// gains = 2 / (1 + exp(-x C)), [F].
-inline void context_gains(const Network& network, const Lanes* x, Lanes* gains) {
+// gates = 2 / (1 + exp(-x C)), [F].
+inline void feature_gates(const Network& network, const Lanes* x, Lanes* gates) {
   const std::size_t size = network.features;
   for (std::size_t j = 0; j < size; ++j) {
     float sum[kLanes] = {};
@@ -171,7 +171,7 @@ inline void context_gains(const Network& network, const Lanes* x, Lanes* gains) 
       for (std::size_t k = 0; k < kLanes; ++k) sum[k] += weight * x[i].at[k];
     }
     for (std::size_t k = 0; k < kLanes; ++k) {
-      gains[j].at[k] = 2.0f / (1.0f + std::exp(-sum[k]));
+      gates[j].at[k] = 2.0f / (1.0f + std::exp(-sum[k]));
     }
   }
 }
@@ -190,7 +190,7 @@ inline const Lanes* forward(const Network& network, Lanes* x, Lanes* y) {
 inline void score_block(const Network& network, const float* features, std::size_t count,
                         Valid valid, Lanes* work, float* values) {
   const std::size_t times = network.times(), size = network.features;
-  Lanes *x = work, *y = work + network.width(), *gains = y + network.width();
+  Lanes *x = work, *y = work + network.width(), *gates = y + network.width();
   double total[kLanes] = {};
   bool refused[kLanes] = {};
   for (std::size_t t = 0; t < times; ++t) {
@@ -207,9 +207,9 @@ inline void score_block(const Network& network, const float* features, std::size
     if (!any) continue;
     normalise(network, rows, x);
     if (!network.scene_gating.empty()) {
-      if (t == 0) context_gains(network, x, gains);
+      if (t == 0) feature_gates(network, x, gates);
       for (std::size_t f = 0; f < size; ++f) {
-        for (std::size_t k = 0; k < kLanes; ++k) x[f].at[k] *= gains[f].at[k];
+        for (std::size_t k = 0; k < kLanes; ++k) x[f].at[k] *= gates[f].at[k];
       }
     }
     const Lanes* reward = forward(network, x, y);
