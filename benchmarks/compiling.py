@@ -98,7 +98,7 @@ def _rows() -> dict[str, Row]:
         ),
         "loop: driver models": loop(rule_policy, rule("IDM")),
         "loop: learned": loop(policy, ranked),
-        "loop: hand-set": loop(policy, ranking(weights, "hand-set", (0.0, 0.0))),
+        "loop: hand-set": loop(policy, ranking(weights, "hand-set", 0.0)),
     }
 
 

@@ -155,6 +155,25 @@ COMMANDS = (
         },
     ),
     Command(
+        "dial_verdict",
+        30,
+        "rcirl_jax gate --candidate={after}/dials/0.5.msgpack --incumbent=hand-set "
+        "--data={us101},{urban},{i80} --tuned_idm={after}/tuned_idm.json "
+        "--output={out}/verdict.json --workers=2",
+        {"dial_verdict": "verdict.json"},
+        after="chain",
+    ),
+    Command(
+        "gains",
+        15,
+        "rcirl_jax simulate --weights={after}/dials/0.25.msgpack,"
+        "{after}/dials/0.5.msgpack,{after}/weights.msgpack,{after}/dials/2.msgpack,"
+        "{after}/dials/4.msgpack --suite=full --cases=10 --catalogue_seed=1 "
+        "--baselines=hand-set --output={out}",
+        {"gains": "suite.json"},
+        after="chain",
+    ),
+    Command(
         "search",
         30,
         "rcirl_jax simulate --weights={after}/weights.msgpack --dp --suite=full "

@@ -21,9 +21,8 @@ ROWS = {  # of the closed-loop table: row of the files -> its name in the pages
 }
 SITES = {"US-101": "us101", "urban": "urban", "I-80": "i80"}  # of docs/rankings.md
 LEARNERS = (
-    *("MaxEnt 32-16", "MaxEnt monotone 32-16", "logistic free"),
-    *("logistic non-negative", "RC-IRL logistic", "GAN free", "RC-IRL rank"),
-    *("IDM, tuned", "hand-set, tuned long", "IDM", "constant speed", "hand-set"),
+    *("MaxEnt 32-16", "MaxEnt monotone 32-16", "logistic non-negative"),
+    *("RC-IRL logistic", "RC-IRL rank", "GAN", "IDM", "constant speed", "hand-set"),
 )
 
 
