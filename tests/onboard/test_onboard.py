@@ -115,7 +115,7 @@ def test_ten_thousand_totals_equal_python(programs, tmp_path):
 
 
 def test_a_file_that_planners_have_scores_as_it_did(programs, tmp_path):
-    kept, features, valid, value, _, own, total = test_weights.golden()
+    kept, features, valid, value, own, total = test_weights.golden()
     path = shutil.copy(kept, tmp_path / "weights.msgpack")
     assert_close(scores(programs, "score", path, features, valid == 1), value)
     assert_close(scores(programs, "total", path, features, own, valid == 1), total)

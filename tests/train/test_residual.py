@@ -121,11 +121,11 @@ def test_the_file_says_the_gain_that_was_learned(dataset, tmp_path):
     beta = float(jnp.exp(restore_run(tmp_path / "run", config).params["log_beta"]))
     prior, own = reward.prior_cost, own_cost(config.residual_on)
     assert prior.incumbent == "headway_cost"
-    assert prior.low == prior.high == pytest.approx(0.5 / beta, rel=1e-5)
+    assert prior.gain == pytest.approx(0.5 / beta, rel=1e-5)
     assert beta != 1.0
     assert reward.provenance["own_cost"]["sha256"] == own.sha256
     _, params = score_of(reward, own)
-    assert float(params.low) == pytest.approx(prior.low)
+    assert float(params.gain) == pytest.approx(prior.gain)
 
 
 def test_a_residual_ranks_what_a_planner_could_drive():
