@@ -19,7 +19,7 @@ from absl import app, flags
 from benchmarks.common import percentiles, untrained, write
 from rcirl_jax.export.loading import open_reward, reward_params
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.dp import DpConfig, Weights, plan_dp
+from rcirl_jax.planner.dp import DpConfig, Weights, search
 from rcirl_jax.planner.rank import ONLINE, Score, learned_score
 from rcirl_jax.planner.safety import check
 from rcirl_jax.reward import RewardConfig
@@ -63,11 +63,13 @@ def _ranking(count: int, weights: Weights, score: Score) -> Planner:
 
 def _lattice(step: float, weights: Weights, activation: str) -> Planner:
     """Value of the lattice's plan, twice."""
-    config, features = DpConfig(step=step), feature_map("paper21")
+    config = DpConfig(step=step, proposals=1)
+    features = feature_map("paper21")
 
     def plan(scene: Scene) -> tuple[jax.Array, jax.Array]:
-        found = plan_dp(scene, weights, features, activation, config)
-        return jnp.where(found.feasible, found.value, -jnp.inf), found.value
+        found = search(scene, weights, features, activation, config)
+        (value,) = found.value
+        return jnp.where(found.feasible[0], value, -jnp.inf), value
 
     return jax.jit(plan)
 

@@ -88,7 +88,7 @@ from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
 from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.tuning.prior_cost import OWN_COST
+from rcirl_jax.tuning.prior_cost import OWN_COST, some_scenes
 from rcirl_jax.types import Scene
 
 _LOSSES = flags.DEFINE_list(
@@ -103,7 +103,6 @@ fixed(horizon=5.0)  # of the ranking; learners compare as far as the recipe says
 FORMS = ("alone", "anchored")
 BASELINES = (OWN_COST, "IDM", *TRIVIAL_BASELINES)
 RANKED_BASELINES = (OWN_COST, "IDM")
-SPREAD_SCENES = 256  # of each source
 
 
 def configs() -> dict[str, TrainConfig]:
@@ -154,14 +153,6 @@ def trained(
         found += runs
     features = feature_map(shared.features)
     return found, seen_range(fitting_rows(frozen, shared), features)
-
-
-def some_scenes(sources: Sequence[Demonstrations]) -> tuple[Scene, np.ndarray]:
-    """Training scenes, as many of every source, and their rows; numpy leaves."""
-    each = [one.indices("train") for one in sources]
-    rows = [x[np.linspace(0, x.size - 1, SPREAD_SCENES).astype(int)] for x in each]
-    scenes = [one.read(row).scene for one, row in zip(sources, rows, strict=True)]
-    return jax.tree.map(lambda *x: np.concatenate(x), *scenes), np.concatenate(rows)
 
 
 @functools.partial(jax.jit, static_argnames="score")

@@ -163,7 +163,7 @@ def main() -> None:
 
 
 def _mode() -> str:
-    """What baselines that rank candidates plan."""
+    """Returns the mode of baselines that rank candidates."""
     files = _WEIGHTS.value
     return _MODE.value or (open_reward(files[0]).mode if files else "speed")
 

@@ -166,7 +166,7 @@ class DpConfig:
 
 
 class Objective(flax.struct.PyTreeNode, kw_only=True):
-    """What is added up besides the learned reward; of one scene."""
+    """The rest of the sum besides the learned reward; of one scene."""
 
     gain: ArrayLike = 1.0  # [] of V
     reference: Trajectory | None = None  # leaves [T], where the own cost is no sum
@@ -525,7 +525,7 @@ def _carried(
     config: DpConfig,
     activation: str,
 ) -> jax.Array:
-    """What the last counted time adds [K, M, N]: the acceleration is carried over."""
+    """The share [K, M, N] of the last counted time: the acceleration is carried on."""
 
     def of(i: int, k: int) -> jax.Array:
         a = jnp.full((1,), k * config.step)
@@ -683,20 +683,6 @@ def search(
         )
 
 
-def plan_dp(
-    scene: Scene,
-    weights: Weights,
-    features: FeatureMap,
-    activation: str,
-    config: DpConfig,
-    objective: Objective = V_ALONE,
-) -> DpPlan:
-    """The best plan of `search`, with the same arguments."""
-    config = dataclasses.replace(config, proposals=1)
-    plans = search(scene, weights, features, activation, config, objective)
-    return jax.tree.map(lambda x: x[0], plans)
-
-
 SMOOTHNESS = 0.02  # s^6, weight of jerk squared against metres squared
 
 
@@ -789,10 +775,10 @@ def dp_policy(
     ) -> Plan:
         params, alone = searching
         sampled = sample(key, scene, rank.sampler)
-        scores = score(params, scene, sampled)
+        values = score(params, scene, sampled)
         admissible = check(scene, sampled, rank.safety).admissible
-        nearest = jnp.argmax(jnp.where(admissible, scores, -jnp.inf))
-        reference = jax.tree.map(lambda x: x[nearest], sampled.trajectory)
+        best = jnp.argmax(jnp.where(admissible, values, -jnp.inf))
+        reference = jax.tree.map(lambda x: x[best], sampled.trajectory)
         on_path = along(scene, reference) if rank.steers else scene
         objective = Objective(
             gain=params.gain,
@@ -810,10 +796,9 @@ def dp_policy(
         proposed = Candidates(trajectory=found, feasible=may, family=family)
         stops = ~alone | (sampled.family == family_index("emergency"))
         sampled = sampled.replace(feasible=sampled.feasible & stops)
-        both = lambda *x: jnp.concatenate(x)  # noqa: E731
-        candidates = jax.tree.map(both, sampled, proposed)
-        candidates = with_plan_in_force(candidates, in_force)
-        scores = score(params, scene, candidates)
+        added = with_plan_in_force(proposed, in_force)
+        candidates = jax.tree.map(lambda *x: jnp.concatenate(x), sampled, added)
+        scores = jnp.concatenate([values, score(params, scene, added)])
         return best_plan(scene, candidates, scores, rank, in_force)
 
     return committed(replan, rank.sampler, rank.safety, rank.commitment)
@@ -850,7 +835,9 @@ def optimality_gap(
       Scalars: `admissible`, whether the plan passes the safety filter; `gap` G >= 0,
       NaN where it does not; `normalised` g, NaN too where braking is as good.
     """
-    plan = plan_dp(scene, weights, features, activation, lattice)
+    lattice = dataclasses.replace(lattice, proposals=1)
+    found = search(scene, weights, features, activation, lattice)
+    plan = jax.tree.map(lambda x: x[0], found)
     # a lattice without a plan gives a trajectory that means nothing
     finer = jax.tree.map(
         lambda a, b: jnp.where(plan.feasible, a, b), plan.trajectory, trajectory

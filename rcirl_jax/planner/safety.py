@@ -344,13 +344,13 @@ def _touches(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
     behind = (0.5 * (s_upper + s_lower) - x.s[first] < 0.0) & in_way  # [N, K]
     moves = (xp.abs(speed[:, 0]) > MOVING_MPS) & (obstacles.kind != Kind.STATIC)
     starts = TIMES_S[:-1, None]
-    entry, brakes = config.entry and config.track == "full", behind
-    if entry:  # [N, T - 1, K]: whom the ego has moved in ahead of
+    excused = behind[:, None]  # [N, 1 or T - 1, K]: bodies that have to brake
+    if config.entry and config.track == "full":  # whom the ego has moved in ahead of
         is_in, enters, ahead = _entries(scene, x, config)
         drives = (obstacles.kind <= Kind.CYCLIST)[:, None]
         follows = drives & xp.any(enters & ~ahead[:, 1:], axis=1)
         follows = follows & ~xp.any(enters & ahead[:, 1:], axis=1)
-        brakes = is_in[:, :-1] & follows[:, None]
+        excused = excused | (is_in[:, :-1] & follows[:, None])
     for n in range(obstacles.kind.shape[0]):
         if xp is np and not known[n].any():  # XLA cannot see it, numpy can
             yield np.zeros(x.s[:-1].shape, bool)
@@ -368,8 +368,7 @@ def _touches(scene: Scene, x: Motion, config: SafetyConfig) -> Iterator[Array]:
         cross = xp.abs(m_s * (dl[1:] - dl[:-1]) - m_l * (ds[1:] - ds[:-1]))
         near = (xp.abs(m_s) <= e_s + h_s) & (xp.abs(m_l) <= e_l + h_l)
         near = near & (0.5 * cross <= e_s * h_l + e_l * h_s)
-        near = near & known[n] & ~behind[n]
-        yield near & ~brakes[n] if entry else near
+        yield near & known[n] & ~excused[n]
 
 
 def _crossings(scene: Scene, x: Motion, config: SafetyConfig) -> Array:
@@ -425,7 +424,7 @@ def _entries(scene: Scene, x: Motion, config: SafetyConfig) -> tuple[Array, ...]
 
 
 def _beside(scene: Scene, l: Array) -> Array:
-    """How far [N, T, K] m obstacles are beside offsets l [T or 1, K]; < 0: in way."""
+    """Gap [N, T, K] m aside between obstacles and offsets l [T or 1, K]; < 0: none."""
     o = scene.obstacles
     xp = namespace(l, o.l_lower)
     return xp.maximum(o.l_lower[..., None] - l, l - o.l_upper[..., None])

@@ -120,6 +120,32 @@ def _ratio(x: jax.Array, valid: jax.Array) -> jax.Array:
     return square / (size + 1e-6)
 
 
+def approach_speed(
+    stop: Float[Array, "..."], virtual: Float[Array, "..."], weights: LatticeCost
+) -> Float[Array, "..."]:
+    """The speed m/s from which the nearer of two lines, m away, is reached gently.
+
+    sqrt(2 * comfort_braking * distance), or inf where there is none
+    """
+    to_stop = jnp.minimum(stop, virtual)
+    braking = jnp.sqrt(jnp.multiply(2.0, weights.comfort_braking) * to_stop)
+    return jnp.where(to_stop >= LINE_CAP_M, jnp.inf, braking)
+
+
+def nearness(
+    ahead: Float[Array, "..."], behind: Float[Array, "..."], weights: LatticeCost
+) -> Float[Array, "..."]:
+    """How near one comes to who is ahead and behind, gaps in m: 1 within the buffers.
+
+    exp(-distance^2 / (2 sigma^2))
+    """
+    distance = jnp.minimum(
+        jnp.maximum(ahead - weights.yield_buffer, 0.0),
+        jnp.maximum(behind - weights.overtake_buffer, 0.0),
+    )
+    return jnp.exp(-0.5 * (distance / weights.collision_sigma) ** 2)
+
+
 def lattice_terms(
     scene: Scene, trajectory: Trajectory, weights: LatticeCost = LatticeCost()
 ) -> LatticeTerms:
@@ -132,18 +158,14 @@ def _terms(frame: Frame, valid: jax.Array, weights: LatticeCost) -> LatticeTerms
     x = frame.point
     column = {name: COLUMNS[name](frame) for name in _READ}
     times = jnp.asarray(TIMES_S).reshape(valid.shape)
-    to_stop = jnp.minimum(column["stop_distance"], column["virtual_distance"])
-    braking = jnp.sqrt(jnp.multiply(2.0, weights.comfort_braking) * to_stop)
-    distance = jnp.minimum(
-        jnp.maximum(column["follow_distance"] - weights.yield_buffer, 0.0),
-        jnp.maximum(column["overtake_distance"] - weights.overtake_buffer, 0.0),
-    )
-    distance = jnp.where(column["collision"] > 0.0, 0.0, distance)
-    near = jnp.exp(-0.5 * (distance / weights.collision_sigma) ** 2)
+    near = nearness(column["follow_distance"], column["overtake_distance"], weights)
+    near = jnp.where(column["collision"] > 0.0, 1.0, near)
     comfort = jnp.abs(x.ddl * x.v**2 + x.dl * x.a)
     return LatticeTerms(
         limit=column["speed_limit"],
-        approach=jnp.where(to_stop >= LINE_CAP_M, jnp.inf, braking),
+        approach=approach_speed(
+            column["stop_distance"], column["virtual_distance"], weights
+        ),
         speed=x.v,
         early=jnp.where(valid, times**2, 0.0),
         travelled=jnp.max(jnp.where(valid, x.s, 0.0), axis=0),

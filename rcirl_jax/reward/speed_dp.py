@@ -50,6 +50,46 @@ class SpeedDpCost:
         return {name: jnp.asarray(value, jnp.float32) for name, value in pairs}
 
 
+def point_cost(
+    limit: Float[Array, "..."],
+    v: Float[Array, "..."],
+    s: Float[Array, "..."],
+    ahead: Float[Array, "..."],
+    behind: Float[Array, "..."],
+    weights: SpeedDpCost,
+) -> Float[Array, "..."]:
+    """The part of `speed_dp_cost` that place and speed decide at one time, per s.
+
+    Arguments are broadcast.
+
+    Args:
+      limit: m/s, speed limit.
+      v: m/s.
+      s: m, station.
+      ahead: m, gap to the nearest ahead.
+      behind: m, to the nearest behind.
+      weights: of the cost.
+    """
+    limit = jnp.maximum(limit, 0.1)
+    over = (v - limit) / limit
+    off_speed = (
+        weights.exceed * jnp.maximum(over, 0.0) ** 2
+        + weights.below * jnp.maximum(-over, 0.0)
+        + weights.cruise * jnp.abs(v - limit)
+    )
+    near = jnp.maximum(weights.safe_distance - ahead, 0.0) ** 2
+    near = near + jnp.maximum(weights.safe_distance - behind, 0.0) ** 2
+    return weights.speed * off_speed + weights.obstacle * near - weights.way * s
+
+
+def effort_cost(a: Float[Array, "..."], weights: SpeedDpCost) -> Float[Array, "..."]:
+    """The part of `speed_dp_cost` that acceleration `a` m/s^2 decides, per s."""
+    effort = jnp.where(a > 0.0, weights.acceleration, weights.braking)
+    soft = weights.acceleration**2 * jax.nn.sigmoid(a - weights.max_acceleration)
+    soft = soft + weights.braking**2 * jax.nn.sigmoid(-a - weights.max_braking)
+    return jnp.asarray(a**2 * (effort + soft))
+
+
 def speed_dp_cost(
     scene: Scene, trajectory: Trajectory, weights: SpeedDpCost = SpeedDpCost()
 ) -> Float[Array, ""]:
@@ -67,27 +107,12 @@ def speed_dp_cost(
     """
     frame = make_frame(scene, trajectory)
     column = {name: COLUMNS[name](frame) for name in _READ}
-    v, a, j = trajectory.v, trajectory.a, trajectory.j
-    limit = jnp.maximum(column["speed_limit"], 0.1)
-    over = (v - limit) / limit
-    off_speed = (
-        weights.exceed * jnp.maximum(over, 0.0) ** 2
-        + weights.below * jnp.maximum(-over, 0.0)
-        + weights.cruise * jnp.abs(v - limit)
-    )
-    effort = jnp.where(a > 0.0, weights.acceleration, weights.braking)
-    soft = weights.acceleration**2 * jax.nn.sigmoid(a - weights.max_acceleration)
-    soft = soft + weights.braking**2 * jax.nn.sigmoid(-a - weights.max_braking)
-    near = jnp.maximum(weights.safe_distance - column["follow_distance"], 0.0) ** 2
-    near = near + (
-        jnp.maximum(weights.safe_distance - column["overtake_distance"], 0.0) ** 2
-    )
+    gaps = column["follow_distance"], column["overtake_distance"]
+    here = column["speed_limit"], trajectory.v, trajectory.s
     at_time = (
-        weights.speed * off_speed
-        + a**2 * (effort + soft)
-        + weights.jerk * j**2
-        + weights.obstacle * near
-        - weights.way * trajectory.s
+        point_cost(*here, *gaps, weights)
+        + effort_cost(trajectory.a, weights)
+        + weights.jerk * trajectory.j**2
     )
     counts = scene.time_valid.at[0].set(False)
     hits = jnp.any((column["collision"] > 0.0) & scene.time_valid)

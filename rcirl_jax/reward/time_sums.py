@@ -21,8 +21,18 @@ import jax.numpy as jnp
 
 from rcirl_jax.features.columns import COLUMNS
 from rcirl_jax.features.mapping import candidate_frames, make_frame
-from rcirl_jax.reward.hand import LatticeCost, lattice_terms
-from rcirl_jax.reward.speed_dp import SPEED_DP_ROW, SpeedDpCost
+from rcirl_jax.reward.hand import (
+    LatticeCost,
+    approach_speed,
+    lattice_terms,
+    nearness,
+)
+from rcirl_jax.reward.speed_dp import (
+    SPEED_DP_ROW,
+    SpeedDpCost,
+    effort_cost,
+    point_cost,
+)
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.types import Scene, Trajectory
 from rcirl_jax.units import DT_S, NUM_TIMES
@@ -31,7 +41,7 @@ LEAST_SUM = 1.0  # of D_0: a reference without jerk would forbid any
 
 
 class Grid(NamedTuple):
-    """Where a sum is wanted."""
+    """The places at which a sum is wanted."""
 
     stations: jax.Array  # [N] m
     speeds: jax.Array  # [U] m/s
@@ -92,23 +102,12 @@ def _speed_dp(scene: Scene, grid: Grid, reference: Trajectory | None) -> TimeSum
     weights = SpeedDpCost()
     names = ("speed_limit", "follow_distance", "overtake_distance")
     limit, ahead, behind = _columns(scene, grid.stations, names).values()
-    limit = jnp.maximum(limit, 0.1)
-    v, a = grid.speeds[:, None], grid.actions
-    over = (v - limit) / limit
-    off_speed = (
-        weights.exceed * jnp.maximum(over, 0.0) ** 2
-        + weights.below * jnp.maximum(-over, 0.0)
-        + weights.cruise * jnp.abs(v - limit)
-    )
-    near = [jnp.maximum(weights.safe_distance - x, 0.0) ** 2 for x in (ahead, behind)]
-    cost = weights.speed * off_speed + weights.obstacle * sum(near)
-    effort = jnp.where(a > 0.0, weights.acceleration, weights.braking)
-    soft = weights.acceleration**2 * jax.nn.sigmoid(a - weights.max_acceleration)
-    soft = soft + weights.braking**2 * jax.nn.sigmoid(-a - weights.max_braking)
+    here = limit, grid.speeds[:, None], grid.stations
     counts = scene.time_valid.at[0].set(False).astype(jnp.float32)
+    cost = point_cost(*here, ahead, behind, weights)
     return TimeSum(
-        point=-DT_S * counts[:, None, None] * (cost - weights.way * grid.stations),
-        action=-DT_S * a**2 * (effort + soft),
+        point=-DT_S * counts[:, None, None] * cost,
+        action=-DT_S * effort_cost(grid.actions, weights),
         square=jnp.asarray(-DT_S * weights.jerk),
         size=jnp.zeros(()),
         counts=counts,
@@ -128,37 +127,30 @@ def _lattice(scene: Scene, grid: Grid, reference: Trajectory) -> TimeSum:
     frame = make_frame(scene, reference)
     there = {name: COLUMNS[name](frame) for name in names}
 
-    def near(ahead: jax.Array, behind: jax.Array) -> jax.Array:
-        distance = jnp.minimum(
-            jnp.maximum(ahead - weights.yield_buffer, 0.0),
-            jnp.maximum(behind - weights.overtake_buffer, 0.0),
-        )
-        return jnp.exp(-0.5 * (distance / weights.collision_sigma) ** 2)
-
     def slopes(at_reference: jax.Array, ratio: jax.Array) -> tuple:
-        """What x^2 and |x| count in a ratio about its value [] at the reference [T]."""
+        """Weights of x^2 and |x| in a ratio about its value [] at the reference [T]."""
         total = jnp.sum(jnp.where(valid, jnp.abs(at_reference), 0.0))
-        return 1.0 / jnp.maximum(total, LEAST_SUM), -ratio / jnp.maximum(
-            total, LEAST_SUM
-        )
+        total = jnp.maximum(total, LEAST_SUM)
+        return 1.0 / total, -ratio / total
 
     def linear(x: jax.Array, at_reference: jax.Array, ratio: jax.Array) -> jax.Array:
         square, size = slopes(at_reference, ratio)
         return square * x**2 + size * jnp.abs(x)
 
     v = grid.speeds[:, None]
-    braking = jnp.sqrt(2.0 * weights.comfort_braking * jnp.minimum(stop, virtual))
-    wanted = jnp.minimum(limit * weights.speed_share, braking)
+    approach = approach_speed(stop, virtual, weights)
+    wanted = jnp.minimum(limit * weights.speed_share, approach)
     early = (terms.early / jnp.maximum(jnp.sum(terms.early), DT_S**2))[:, None, None]
     # the way travelled is the station at the last time that counts
     last = (valid & ~jnp.append(valid[1:], False))[:, None, None]
     far = weights.objective_distance / (1.0 + grid.stations)
     objective = weights.objective_speed * early * jnp.abs(wanted - v) + last * far
     objective = objective / (weights.objective_speed + weights.objective_distance)
-    at_contact = near(there["follow_distance"], there["overtake_distance"])
+    near = nearness(ahead, behind, weights)
+    near_there = nearness(there["follow_distance"], there["overtake_distance"], weights)
     cost = (
         weights.objective * objective
-        + weights.collision * linear(near(ahead, behind), at_contact, terms.collision)
+        + weights.collision * linear(near, near_there, terms.collision)
         + weights.centripetal
         * linear(bend * v**2, there["lateral_acceleration"], terms.centripetal)
     )

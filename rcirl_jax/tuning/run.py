@@ -159,7 +159,7 @@ class Run:
 
     @property
     def decided(self) -> Path:
-        """How often the candidate plans otherwise than its own cost would."""
+        """The share of plans that differ from the own cost's choice."""
         return self.folder / "decided.json"
 
     @property

@@ -19,7 +19,6 @@ from rcirl_jax.planner.dp import (
     dp_policy,
     make_lattice,
     make_layers,
-    plan_dp,
     search,
     smoothed,
 )
@@ -69,7 +68,14 @@ SCORE = jax.jit(learned_score(FEATURES, SHAPE.activation))
 
 @functools.cache
 def planner(config):
-    return jax.jit(lambda s, w: plan_dp(s, w, FEATURES, SHAPE.activation, config))
+    return jax.jit(lambda s, w: best(s, w, config))
+
+
+def best(scene, w, config, **objective):
+    """The best plan of a search."""
+    config = dataclasses.replace(config, proposals=1)
+    plans = search(scene, w, FEATURES, SHAPE.activation, config, Objective(**objective))
+    return jax.tree.map(lambda x: x[0], plans)
 
 
 @jax.jit
@@ -207,11 +213,7 @@ RANKED = jax.jit(ranking_score(FEATURES, SHAPE.activation))
 def test_an_own_cost_that_is_a_sum_is_searched_exactly(own):
     """The recursion adds up what the planner's score says of the plan."""
     gain, found = 3.0, 0
-    plan_of = jax.jit(
-        lambda made, w: plan_dp(
-            made, w, FEATURES, SHAPE.activation, COARSE, Objective(gain=gain, own=own)
-        )
-    )
+    plan_of = jax.jit(lambda made, w: best(made, w, COARSE, gain=gain, own=own))
     for seed in range(5):
         made, w = scene_of(seed), weights(seed)
         plan = plan_of(made, w)

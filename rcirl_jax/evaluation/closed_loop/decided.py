@@ -1,4 +1,4 @@
-"""How much the learned part decides: plans that differ from the own cost's choice.
+"""The share of the learned part: plans that differ from the own cost's choice.
 
 Every four seconds of its drives the candidate and its own cost alone choose in the same
 scene, among the same candidates and with the same plan in force
