@@ -13,6 +13,7 @@ import pytest
 from markupsafe import Markup
 
 from rcirl_jax.evaluation.closed_loop.summary import PAPER, comfort_cells, summarise
+from rcirl_jax.evaluation.gate.types import Check
 from rcirl_jax.evaluation.ranking.score import candidates_key
 from rcirl_jax.report.features import NUM_CANDIDATES, contributions
 from rcirl_jax.report.frames import _sampled
@@ -210,6 +211,21 @@ def test_safety_that_is_not_shown_is_no_green_card(report):
         verdict = dataclasses.replace(report.verdict, checks=checks)
         kinds[outcome] = cards(verdict, suite, "hand-set")[2]["kind"]
     assert kinds == {"pass": "ship", "open": "open", "fail": "refused"}
+
+
+@pytest.mark.parametrize(("outcome", "kind"), [("pass", "ship"), ("open", "open")])
+def test_a_gain_that_the_verdict_does_not_call_one_is_no_green_card(
+    report, outcome, kind
+):
+    """Holm's correction may refuse what an interval above 0 suggests."""
+    gain = Check(
+        kind="gain", name="likeness", title="", outcome=outcome, difference=0.3,
+        low=0.06, high=0.53, margin=None, gained=None, lost=None, p=0.057,
+    )  # fmt: skip
+    verdict = dataclasses.replace(report.verdict, checks=(gain,))
+    card = cards(verdict, summarise(report.suite), "hand-set")[1]
+    assert card["kind"] == kind
+    assert ("not certain" in card["words"]) == (outcome == "open")
 
 
 def test_terms_are_explained_where_they_stand_and_in_a_list(page):

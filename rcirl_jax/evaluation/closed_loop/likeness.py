@@ -35,7 +35,7 @@ from rcirl_jax.evaluation.gate.types import Likeness
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
     combine_seeds,
-    paired_difference,
+    over_clusters,
 )
 from rcirl_jax.planner.mobil import MOBIL_ROW
 from rcirl_jax.planner.program import name_cases
@@ -113,9 +113,9 @@ class LikenessReport:
     def facts(self) -> dict:
         """All numbers, for a JSON file.
 
-        A row's `minus` are its differences to the references, clustered by vehicle;
-        below 0 is nearer. `unlikeness` is the Jensen-Shannon distance to the human's
-        distributions of `HISTOGRAMS`.
+        A row's `minus` are its differences to the references, clustered by vehicle as
+        the gate's are (`over_clusters`); below 0 is nearer. `unlikeness` is the
+        Jensen-Shannon distance to the human's distributions of `HISTOGRAMS`.
         """
         bootstrap, found = ClusterBootstrap(self.clusters), self.distance
         human, body = self.rows[RECORDED_HUMAN], {}
@@ -138,7 +138,7 @@ class LikenessReport:
                 "not_driven": row.not_driven,
                 "minus": {
                     other: dataclasses.asdict(
-                        paired_difference(row.distance, found[other], bootstrap)
+                        over_clusters(row.distance, found[other], bootstrap)
                     )
                     for other in others
                     if name != RECORDED_HUMAN
