@@ -13,7 +13,7 @@ def made(folder):
     return folder
 
 
-WHOLE = ["interaction", "levelx_highd", "ngsim_pairs", "openacc"]
+WHOLE = ["levelx_highd", "openacc"]  # with and without a reader of its own
 
 
 def first_file(name, folder):
@@ -31,7 +31,7 @@ def test_a_log_that_is_held_whole_has_a_size(name, tmp_path):
 
 
 @pytest.mark.parametrize("where", ["header", "rows", "cell"])
-@pytest.mark.parametrize("name", [*WHOLE, "csv", "ngsim"])
+@pytest.mark.parametrize("name", ["openacc", "csv"])
 def test_a_line_without_an_end_is_not_held(name, where, tmp_path, monkeypatch):
     """All of it on one line; a sound head, then a line of cells, or of a wide one."""
     monkeypatch.setattr(streams, "MAX_LINE", 2**14)

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.specs import spec_root
 from rcirl_jax.types import Kind
 from tests.data.formats import people
 from tests.data.formats import writers as w
@@ -152,19 +151,6 @@ def test_lanes_of_the_mapping_and_of_a_file(tmp_path):
     first, second = only(tmp_path, source).lanes
     np.testing.assert_array_equal(first.left_width, [1.5, 2.0])
     assert (first.successors, second.speed_limit) == (("b",), 9.0)
-
-
-def test_example_mapping_reads_what_it_describes(tmp_path):
-    header = "timestamp object east north yaw velocity length width class lane drive"
-    rows = [
-        [round(1000 * t), name, x, y, 0.0, 3.6 * v, length, width, "car", lane, "d1"]
-        for t, name, x, y, v, length, width, lane in cars()
-    ]
-    source = spec_root() / "sources" / "csv_example.toml"
-    recording = only(log(tmp_path, rows, header.split()), source)
-    np.testing.assert_allclose(recording.tracks[0].speed, 15.0)
-    assert [lane.id for lane in recording.lanes] == ["1", "2"]
-    assert recording.notes == ()
 
 
 def test_buses_are_no_feet(tmp_path):

@@ -19,7 +19,7 @@ from rcirl_jax.evaluation.closed_loop.runs import read_runs
 from rcirl_jax.runtime.specs import load_toml
 from tests.conftest import REPO
 from tests.data.formats import people
-from tests.data.formats.damage import Bomb
+from tests.data.formats.test_conformance import Bomb
 from tests.helpers.logs import read, refused
 
 DEEP = 100_000  # levels
@@ -61,28 +61,13 @@ def test_pickles_in_a_suite_are_not_loaded(members, tmp_path):
     assert not (tmp_path / "executed").exists()
 
 
-def texts(order, point):
-    return npy(np.array([point, 65], f"{order}u4").view(f"{order}U1"))
-
-
-SIZES, METRICS = (
-    "of float64 in 64 bytes: expected the",
-    "expected the metrics of a suite",
-)
-BAD_TEXT = "ids: characters that are none"
+METRICS = "expected the metrics of a suite"
 BAD_MEMBERS = [
-    *[("way", head(n) + bytes(64), SIZES) for n in ((2**62,), (10**30,), (-1,))],
-    # texts of no length take no room in the file, and as Python's some gigabytes
-    ("names", head((10**6,), "<U0"), "names: 1000000 values in 0 bytes"),
+    ("way", head((2**62,)) + bytes(64), "of float64 in 64 bytes: expected the"),
     # a list of many times nothing would take terabytes
-    *[("ids", head((2**40, 0, 0), kind), METRICS) for kind in ("<f8", "<U1")],
-    *[("way", head(2, kind), METRICS) for kind in ("(,)f8", "f8,(", "f9", "")],
-    *[("ids", texts("<", point), BAD_TEXT) for point in (0x110000, 0xD800)],
-    ("ids", texts(">", 2**32 - 1), BAD_TEXT),
+    ("ids", head((2**40, 0, 0)), METRICS),
+    ("way", head(2, "(,)f8"), METRICS),
     ("way", npy(np.array(["far", "near"])), METRICS),
-    ("names", npy(np.array(["ours", "ours"])), METRICS),
-    ("groups", npy(np.array([1, 2])), METRICS),
-    ("row0.inside", npy(np.ones((2, 5))), METRICS),
     ("row0.start_time", None, METRICS),
 ]
 
@@ -108,29 +93,19 @@ def toml(folder, text):
 
 
 LISTS, TABLES = ("[", "", "]"), ("{a=", "1", "}")
-NESTED = [(way, count) for way in (LISTS, TABLES) for count in (110, 1000)]
 
 
-@pytest.mark.parametrize(("way", "count"), [*NESTED, (LISTS, DEEP)])
+@pytest.mark.parametrize(("way", "count"), [(TABLES, 110), (LISTS, DEEP)])
 def test_deep_nesting_is_one_line(tmp_path, way, count):
     text = "a = " + way[0] * count + way[1] + way[2] * count
     assert "nested too deeply" in toml(tmp_path, text)
 
 
-KEYS = [
-    *("{key} = 1", "[ {key} ]", "[[{key}]]", "b = [1,\n {{x = 1, {key} = 1}}]"),
-    'b = {{c = """\n """", {key} = 1}}',
-    "b = {{c = ''' ''''', {key} = 1}}",
-    "b = {{c = '''\n\" ''', {key} = 1}}",
-    'b = {{c = """\n\\""" # """, {key} = 1}}',
-    'b = {{c = "\\" # \' ", {key} = 1}}',
-]
+KEYS = ["{key} = 1", "[[{key}]]", "b = {{c = '''\n\" ''', {key} = 1}}"]
 
 
 @pytest.mark.parametrize("text", KEYS)
-@pytest.mark.parametrize(
-    ("joined", "part"), [(".", "a"), (" .\t", '"a.b"'), (".", "''")]
-)
+@pytest.mark.parametrize(("joined", "part"), [(".", "a"), (" .\t", '"a.b"')])
 def test_keys_of_many_parts(tmp_path, text, joined, part):
     """The parser takes minutes for some thousands of them."""
     line = toml(tmp_path, text.format(key=joined.join([part] * 33)))
@@ -168,20 +143,14 @@ def test_xml_of_entities_or_references_is_refused(tmp_path, dtd):
 # ----------------------------------------------------------------------- options
 
 
-HEX, BAD = "0x" + "f" * 4000, ("../*.csv", "/etc/*", "", "a**", "**/**/x.csv")
+BAD = ("../*.csv", "/etc/*", "", "**/**/x.csv")
 SAME_COLUMN = 'columns = {t = "t", id = "id", x = "id", y = "y"}'
 BAD_OPTIONS = [
     *[(f'pattern = "{bad}"', f"pattern: {bad}: expected file names") for bad in BAD],
-    (f'pattern = "{"x" * 300}"', "expected file names"),
-    (f'pattern = "{"x/" * 600}x"', "/x: expected file names"),
     ("max_bad_rows = 1.0", "max_bad_rows: 1: expected a share from 0 to below 1"),
-    ("max_bad_rows = -0.1", "max_bad_rows: -0.1: expected a share"),
     ("rate_hz = 5" + "0" * 18, "expected at most 1e+18"),
-    (f"rate_hz = {HEX}", "rate_hz: a number of 16000 bits: expected at most 63"),
     ("lanes = [3]", "lanes: [3]: expected tables"),
-    ("speed_limit = 1" + "0" * 400, "bits: expected at most 63"),
     (SAME_COLUMN, "columns.x: id: expected a column of numbers"),
-    ('lanes = {file = "a\\u0000b"}', "file: a?b: expected a path"),
     (f'lanes = {{file = "{"a/" * 3000}x"}}', "a path of 6001 bytes: expected"),
 ]
 
