@@ -1,8 +1,6 @@
 """Checkpoints harmed on disk: found, named, passed over; never half-believed."""
 
 import shutil
-import subprocess
-import sys
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +16,6 @@ from rcirl_jax.train.checkpoint import (
 )
 from rcirl_jax.train.loop import blank_state
 from rcirl_jax.train.state import TrainConfig
-from tests.conftest import REPO
 from tests.data.small_logs import files_of
 from tests.helpers.stored import assert_same_bits
 
@@ -78,16 +75,16 @@ def cut(path, rng):
     path.write_bytes(raw[: int(rng.integers(len(raw)))])
 
 
-HARMS = {"flip": flip, "cut": cut, "delete": lambda path, rng: path.unlink()}
+HARMS = (flip, cut, lambda path, rng: path.unlink())
 
 
-@pytest.mark.parametrize("harm", HARMS)
-def test_harm_to_any_file_is_found_and_named(saved, state, tmp_path, harm):
+def test_harm_to_any_file_is_found_and_named(saved, state, tmp_path):
+    """Each file in one of three ways."""
     assert restored(saved, state) == (4, [])
     rng = np.random.default_rng(0)
     for number, name in enumerate(sorted(files_of(saved / "4"))):
         folder = shutil.copytree(saved, tmp_path / str(number))
-        HARMS[harm](folder / "4" / name, rng)
+        HARMS[number % 3](folder / "4" / name, rng)
         if name.name in MARKS:  # changes nothing
             assert restored(folder, state) == (4, []), name
             continue
@@ -132,39 +129,3 @@ def test_who_only_reads_leaves_everything_as_it_is(folder, state, tmp_path):
     assert files_of(folder) == before
     assert Checkpoints(tmp_path / "none", read_only=True).latest_step is None
     assert not (tmp_path / "none").exists()
-
-
-FULL = """
-import resource, signal, sys
-from pathlib import Path
-from rcirl_jax.errors import InputError
-from rcirl_jax.train.checkpoint import Checkpoints
-from rcirl_jax.train.loop import blank_state
-from rcirl_jax.train.state import TrainConfig
-config = TrainConfig()
-checkpoints = Checkpoints(Path(sys.argv[1]))
-state = blank_state(config)
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, resource.RLIM_INFINITY))
-for attempt in range(2):
-    try:
-        checkpoints.save(state.replace(step=state.step + 5), {})
-    except InputError as error:
-        print(error, file=sys.stderr)
-    resource.setrlimit(resource.RLIMIT_FSIZE, 2 * (resource.RLIM_INFINITY,))
-checkpoints.close()
-"""
-
-
-@pytest.mark.multiprocess
-def test_no_room_is_one_line_and_room_is_taken_when_there_is_some(folder):
-    """Of two attempts to save the first finds no room, the second does."""
-    done = subprocess.run(
-        [sys.executable, "-c", FULL, str(folder)],
-        capture_output=True, text=True, check=False, cwd=REPO, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    (line,) = done.stderr.strip().splitlines()
-    assert line.startswith(f"{folder}: cannot be written: [Errno 27] File too large")
-    assert sorted(x.name for x in folder.iterdir()) == ["3", "4", "5"]
-    assert Checkpoints(folder, read_only=True).latest_step == 5

@@ -11,18 +11,16 @@ import pytest
 
 from rcirl_jax.data.importing import import_logs
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime import signals as interrupts
 from rcirl_jax.runtime.pipeline import only_one
-from rcirl_jax.train.loop import Running, restore_run, train
+from rcirl_jax.train.loop import restore_run
 from tests.data.small_logs import CONFIG as IMPORT
 from tests.data.small_logs import files_of, write_logs
 from tests.helpers.stored import assert_same_bits
-from tests.train.worker import CONFIG
+from tests.train.worker import CONFIG, trained
 
 STEPS = 6  # 21 rows, batches of 8, two epochs
-SHARD_JUMPS = 4  # one for each of three shards, and for the one that is cut short
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +32,7 @@ class StopError(Exception):
     pass
 
 
-def trained(dataset, workdir, stop_after=None, each=lambda step: None):
+def saved(dataset, workdir, stop_after=None, each=lambda step: None):
     """The run, saved after every step; cut short after a step if asked."""
 
     def on_step(step):
@@ -42,24 +40,18 @@ def trained(dataset, workdir, stop_after=None, each=lambda step: None):
         if step == stop_after:
             raise StopError
 
-    running = Running(checkpoint_every=1, on_step=on_step)
     if stop_after is None:
-        return train(dataset, workdir, CONFIG, running=running)
+        return trained(dataset, workdir, checkpoint_every=1, on_step=on_step)
     with pytest.raises(StopError):
-        train(dataset, workdir, CONFIG, running=running)
+        trained(dataset, workdir, checkpoint_every=1, on_step=on_step)
     return None
-
-
-@pytest.fixture(scope="module")
-def undisturbed(dataset, tmp_path_factory):
-    return trained(dataset, tmp_path_factory.mktemp("undisturbed")).state
 
 
 @pytest.fixture(scope="module")
 def cut_short(dataset, tmp_path_factory):
     """A run folder with checkpoints 3, 4 and 5."""
     folder = tmp_path_factory.mktemp("cut") / "run"
-    trained(dataset, folder, stop_after=5)
+    saved(dataset, folder, stop_after=5)
     return folder
 
 
@@ -81,25 +73,25 @@ def test_a_run_goes_on_before_a_damaged_checkpoint(dataset, undisturbed, run, ca
     metrics.write_bytes(metrics.read_bytes()[:-9])
     with pytest.raises(InputError, match=r"checkpoint 5: .* run the training again"):
         restore_run(run, CONFIG)  # what is exported is never an older state
-    result = trained(dataset, run)
+    result = saved(dataset, run)
     (line,) = [x for x in capsys.readouterr().err.splitlines() if "checkpoint" in x]
     assert "checkpoint 5: state/d/" in line
     assert line.endswith("damaged; the one before it that is whole: 4")
-    assert_same_bits(result.state, undisturbed)
+    assert_same_bits(result.state, undisturbed.state)
     assert steps_of(run) == list(range(1, STEPS + 1))
-    assert_same_bits(restore_run(run, CONFIG), undisturbed)
+    assert_same_bits(restore_run(run, CONFIG), undisturbed.state)
 
 
 def test_a_folder_in_use_or_without_a_whole_checkpoint_is_left_alone(dataset, run):
     before = files_of(run)
     with only_one(run), pytest.raises(InputError, match=f"{run}: in use by another"):
-        trained(dataset, run)
+        saved(dataset, run)
     assert files_of(run) == before
     for folder in (run / "checkpoints").glob("[0-9]*"):
         (folder / "position" / "metadata").unlink()
     before = files_of(run)
     with pytest.raises(InputError, match=r"expected one that is whole; use another "):
-        trained(dataset, run)
+        saved(dataset, run)
     assert files_of(run) == before
 
 
@@ -112,12 +104,11 @@ def test_told_to_end_it_saves_the_step_it_is_in(
         if step == 1:  # heard in the second of an epoch's three
             interrupts._Heard.number = signal.SIGTERM
 
-    running = Running(on_step=on_step)
     with pytest.raises(interrupts.Interrupted):
-        train(dataset, tmp_path, CONFIG, running=running)
+        trained(dataset, tmp_path, on_step=on_step)
     assert [x.name for x in (tmp_path / "checkpoints").glob("[0-9]*")] == ["2"]
     interrupts._Heard.number = None
-    assert_same_bits(trained(dataset, tmp_path).state, undisturbed)
+    assert_same_bits(saved(dataset, tmp_path).state, undisturbed.state)
     assert steps_of(tmp_path) == list(range(1, STEPS + 1))
 
 
@@ -145,13 +136,20 @@ def age(folder, by_s):
             os.utime(path, (when, when))
 
 
+def test_rows_read_through_a_window_give_the_same_weights(
+    dataset, undisturbed, tmp_path
+):
+    found = trained(dataset, tmp_path, in_memory_mb=0.0)
+    assert_same_bits(found.state, undisturbed.state)
+
+
 def test_the_time_of_day_decides_nothing(dataset, undisturbed, tmp_path, monkeypatch):
     """Orbax gives up a save that took 300 s of it: one line, the same bits again."""
     clock, ends, result = Clock(), [], None
     monkeypatch.setattr(time, "time", clock)
     while result is None and len(ends) <= STEPS:
         try:
-            result = trained(dataset, tmp_path, each=lambda _: clock.jump())
+            result = saved(dataset, tmp_path, each=lambda _: clock.jump())
         except InputError as error:
             ends.append(str(error))
             age(tmp_path, 86400.0 * (-1) ** len(ends))
@@ -159,35 +157,11 @@ def test_the_time_of_day_decides_nothing(dataset, undisturbed, tmp_path, monkeyp
     assert all("checkpoints: cannot be written: " in line for line in ends)
     assert result is not None, ends
     assert clock.jumps >= STEPS
-    assert_same_bits(result.state, undisturbed)
+    assert_same_bits(result.state, undisturbed.state)
     assert steps_of(tmp_path) == list(range(1, STEPS + 1))
     kept = sorted(x.name for x in (tmp_path / "checkpoints").glob("[0-9]*"))
     assert kept == ["4", "5", "6"]  # the newest by their steps
     assert result.seconds >= 0.0
-
-
-def test_the_time_of_day_decides_nothing_in_an_import(tmp_path, monkeypatch):
-    logs = write_logs(tmp_path / "logs", files=3)
-    monkeypatch.setattr("rcirl_jax.data.importing.SHARD_SCENES", 30)
-    import_logs(logs, tmp_path / "expected", IMPORT)
-    clock = Clock()
-    monkeypatch.setattr(time, "time", clock)
-    write = DatasetWriter.write_shard
-
-    def jumping(self, *rows):
-        clock.jump()
-        if clock.jumps == 2:
-            raise StopError
-        return write(self, *rows)
-
-    monkeypatch.setattr(DatasetWriter, "write_shard", jumping)
-    with pytest.raises(StopError):
-        import_logs(logs, tmp_path / "d", IMPORT)
-    assert len(list((tmp_path / "d").rglob("shard.json"))) == 1
-    age(tmp_path, 86400.0)
-    import_logs(logs, tmp_path / "d", IMPORT)
-    assert clock.jumps == SHARD_JUMPS
-    assert files_of(tmp_path / "d") == files_of(tmp_path / "expected")
 
 
 def test_a_dataset_being_written_is_refused_and_left_alone(tmp_path):

@@ -8,9 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.data.formats import read_recordings
-from rcirl_jax.data.importing import ImportConfig, import_logs
-from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.evaluate import (
     RankingSetup,
@@ -33,30 +30,10 @@ from tests.helpers.stored import assert_same_bits
 SMALL = SamplerConfig(num_random=4, cruise_times=(4.0,), edge_times=(4.0,))
 CONFIG = TrainConfig(batch_size=8, epochs=3, sampler=SMALL)
 
-ROADS = """
-source = "test"
-licence = "none"
-rate_hz = 10.0
-[[recordings]]
-road = "arterial_signals"
-count = 2
-duration_s = 25.0
-density_veh_per_km = 18.0
-seed = 3
-"""
-
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("loop")
-    spec = folder / "roads.toml"
-    spec.write_text(ROADS)
-    import_logs(
-        read_recordings("synthetic", spec),
-        folder / "dataset",
-        ImportConfig(format="synthetic", test_fraction=0.5),
-    )
-    return open_dataset(folder / "dataset")
+def dataset(simulated):
+    return simulated
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +56,7 @@ def test_resume_is_bitwise(dataset, run, tmp_path):
     assert steps == list(range(1, len(steps) + 1))
 
 
-def test_another_seed_compiles_no_step(dataset, run, tmp_path):
+def test_another_seed_compiles_no_step(dataset, tmp_path):
     step_of.cache_clear()
     seeds = [dataclasses.replace(CONFIG, epochs=1, seed=seed) for seed in (0, 1)]
     done = [train(dataset, tmp_path / str(x.seed), x) for x in seeds]
@@ -89,26 +66,15 @@ def test_another_seed_compiles_no_step(dataset, run, tmp_path):
     assert step_of(slower.for_step, "jit").step._cache_size() == 0
     weights = [jax.tree.leaves(x.state.params) for x in done]
     assert any((a != b).any() for a, b in zip(*weights, strict=True))
-    # and a first run of a process does not differ from a later one
-    step_of.cache_clear()
-    alone = train(dataset, tmp_path / "alone", seeds[1])
-    assert_same_bits(alone.state, done[1].state)
 
 
-def test_other_settings_may_not_resume(dataset, run, tmp_path):
+def test_other_settings_may_not_resume(dataset, run):
     with pytest.raises(InputError, match=r"leaky_rate: 0\.05: expected 0\.1"):
         train(dataset, run[0], dataclasses.replace(CONFIG, leaky_rate=0.1))
 
     other = dataclasses.replace(CONFIG, reward=RewardConfig(module="a.b:C"))
     with pytest.raises(InputError, match=r"reward: .*to resume"):
         check_run(run[0], other, dataset)
-    body = json.loads((run[0] / "run.json").read_text())
-    body["config"]["preferences"] = "the hash of a file"
-    (tmp_path / "run.json").write_text(json.dumps(body))
-    for read in (lambda: check_run(tmp_path, CONFIG, dataset),
-                 lambda: read_config(tmp_path)):  # fmt: skip
-        with pytest.raises(InputError, match=r"json: preferences: unknown: expected"):
-            read()
 
 
 def test_run_writes_what_it_should(run):
@@ -196,10 +162,6 @@ def test_a_run_of_a_later_version_is_refused(dataset, run, tmp_path):
     with pytest.raises(InputError, match=r"run\.json: .*momentum.*: expected a run of"):
         export_run(tmp_path, dataset, tmp_path / "weights.msgpack")
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
-    for text in ("{", "[]", '{"config": 3}'):
-        (tmp_path / "run.json").write_text(text)
-        with pytest.raises(InputError, match=r"run\.json: .*expected the file of a tr"):
-            check_run(tmp_path, CONFIG, dataset)
     body["config"] = dataclasses.asdict(CONFIG) | {"reward": {"hidden": 15}}
     (tmp_path / "run.json").write_text(json.dumps(body))
     with pytest.raises(InputError, match=r"run\.json: reward\.hidden: 15: expected a"):

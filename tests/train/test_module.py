@@ -7,20 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.export.forms import exported_module, write_stablehlo
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.rank import RankConfig, module_score, rank_policy
 from rcirl_jax.reward import RewardConfig, RewardModel, value
 from rcirl_jax.train.step import init_state, make_train_step
 from tests.helpers.scenes import random_scene, sampled
-from tests.train.test_step import CONFIG, batch, human_is_better, normaliser
+from tests.train.test_step import CONFIG, human_is_better, normaliser
 
 FEATURES = feature_map("paper21")
 OTHER = RewardConfig(module="tests.reward.others:Residual")
 
 
-@pytest.mark.parametrize("loss", ["rank", "gan"])
-@pytest.mark.parametrize("context", [(), FEATURES.context])
+@pytest.mark.parametrize(("loss", "context"), [("rank", ()), ("gan", FEATURES.context)])
 def test_learns_a_direction(loss, context):
     reward = dataclasses.replace(OTHER, scene_gating=context)
     config = dataclasses.replace(
@@ -41,30 +39,21 @@ def test_learns_a_direction(loss, context):
     assert min(jax.tree.leaves(moved)) > 0.0
 
 
-def test_one_module_trains_exports_and_drives(tmp_path):
-    config = dataclasses.replace(CONFIG, reward=OTHER)
-    state, step = init_state(config, normaliser()), jax.jit(make_train_step(config))
-    for _ in range(3):
-        state, metrics = step(state, batch())
-    assert bool(metrics.finite)
-    model = RewardModel(OTHER)
-
+def test_it_drives_by_the_value_that_is_trained():
+    model, state = (
+        RewardModel(OTHER),
+        init_state(dataclasses.replace(CONFIG, reward=OTHER), normaliser()),
+    )
     scene, key = jax.tree.map(jnp.asarray, random_scene(2)), jax.random.key(2)
     score = module_score(FEATURES, model)
     assert score is module_score(FEATURES, model)  # or a rollout compiles again
     weights, planner = (state.params, state.normaliser), RankConfig()
     candidates = sampled(key, scene, planner.sampler)
     scores = score(weights, scene, candidates)
-
-    made = exported_module(model, state.params, state.normaliser)
-    write_stablehlo(tmp_path / "w.jax", made, "jax")
-    again = jax.export.deserialize(bytearray((tmp_path / "w.jax").read_bytes()))
     x = FEATURES.of_candidates(scene, candidates)
     valid = jnp.broadcast_to(scene.time_valid, x.shape[:2])
     want = value(model, state.params, state.normaliser, x, valid)
-    for found in (again.call(x, scene.time_valid), scores):
-        np.testing.assert_allclose(found, want, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(scores, want, rtol=1e-5, atol=1e-5)
     assert np.ptp(np.asarray(scores)) > 1e-3
-
     plan = jax.jit(rank_policy(score, planner))(weights, scene, key, None)
     assert np.isfinite(np.asarray(plan.s)).all()

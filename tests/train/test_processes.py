@@ -25,11 +25,6 @@ QUICK = f"{QUICKLY} --xla_llvm_disable_expensive_passes=true"
 STEPS = 6  # 21 rows, batches of 8, two epochs: the last batch of an epoch has 5
 
 
-@pytest.fixture(scope="module")
-def data(four_shards):
-    return four_shards
-
-
 def free_port():
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -77,60 +72,42 @@ def finished(workers, workdir):
     return [json.loads(name.read_text()) for name in names]
 
 
-def state_of(workdir):
-    return restore_run(workdir, CONFIG)
-
-
 @pytest.fixture(scope="module")
-def undisturbed(data, tmp_path_factory):
-    """(folder, what it saw) of one device, four in a process, two in each of two."""
-    root = tmp_path_factory.mktemp("runs")
-    shapes = {
-        "1x1": ("jit", 1, 1),
-        "1x4": ("shard_map", 1, 4),
-        "2x2": ("shard_map", 2, 2),
-    }
-    runs = {name: start(data, root / name, *how) for name, how in shapes.items()}
-    return {
-        name: (root / name, finished(workers, root / name))
-        for name, workers in runs.items()
-    }
+def two_by_two(four_shards, tmp_path_factory):
+    """(folder, what each saw) of two processes of two devices."""
+    folder = tmp_path_factory.mktemp("two_by_two")
+    workers = start(four_shards, folder, "shard_map", 2, 2)
+    return folder, finished(workers, folder)
 
 
-def assert_equal_runs(one, other):
+def assert_equals(folder, state):
     """Sums over devices are added in another order: equal to rounding, no further."""
-    for a, b in zip(leaves(state_of(one)), leaves(state_of(other)), strict=True):
+    for a, b in zip(leaves(restore_run(folder, CONFIG)), leaves(state), strict=True):
         np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-5)
 
 
-@pytest.mark.parametrize("name", ["1x4", "2x2"])
-def test_many_devices_equal_one(undisturbed, name):
-    assert_equals_one_device(undisturbed, *undisturbed[name])
+def assert_same_runs(one, other):
+    assert_same_bits(*(restore_run(folder, CONFIG) for folder in (one, other)))
 
 
-def assert_equals_one_device(undisturbed, folder, seen):
-    """A run of four devices, by what its processes saw."""
-    one, (single,) = undisturbed["1x1"]
-    assert_equal_runs(one, folder)
+def test_two_processes_of_two_devices_equal_one(two_by_two, undisturbed):
+    folder, seen = two_by_two
+    assert_equals(folder, undisturbed.state)
+    wanted = {n: [x[n] for x in undisturbed.epochs] for n in ("pairs", "loss")}
     for process in seen:
         assert process["devices"] == 4
         assert process["steps"] == STEPS
-        assert process["pairs"] == single["pairs"]
-        np.testing.assert_allclose(process["loss"], single["loss"], rtol=1e-3)
+        assert process["pairs"] == wanted["pairs"]
+        np.testing.assert_allclose(process["loss"], wanted["loss"], rtol=1e-3)
 
 
-def test_one_process_writes_what_is_written_once(undisturbed):
-    folder, _ = undisturbed["2x2"]
+def test_one_process_writes_what_is_written_once(two_by_two):
+    folder, _ = two_by_two
     lines = (folder / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["step"] for line in lines] == list(range(1, STEPS + 1))
     assert len(list((folder / "tensorboard").iterdir())) == 1
     assert (folder / "run.json").is_file()
     assert "%" not in (folder / "stderr_1").read_text()  # no second progress bar
-
-
-def test_streamed_and_loaded_rows_give_the_same_weights(data, undisturbed, tmp_path):
-    finished(start(data, tmp_path, "jit", 1, 1, in_memory_mb=100.0), tmp_path)
-    assert_same_bits(state_of(tmp_path), state_of(undisturbed["1x1"][0]))
 
 
 def lines_of(workdir, number):
@@ -142,7 +119,7 @@ def lines_of(workdir, number):
 @pytest.mark.slow
 @pytest.mark.parametrize("victim", [1, 0])
 def test_who_loses_another_process_ends_with_one_line(
-    data, undisturbed, tmp_path, victim
+    four_shards, two_by_two, tmp_path, victim
 ):
     """One is killed; the other does not wait for it; both start again.
 
@@ -150,7 +127,7 @@ def test_who_loses_another_process_ends_with_one_line(
     steps: with SIGABRT and lines of its own.
     """
     workers = start(
-        *(data, tmp_path, "shard_map", 2, 2),
+        *(four_shards, tmp_path, "shard_map", 2, 2),
         kill_after=2, victims=[victim], pause_s=0.2,
     )  # fmt: skip
     other = 1 - victim
@@ -164,15 +141,15 @@ def test_who_loses_another_process_ends_with_one_line(
         assert len(said) == 1
         assert "another process is lost" in said[0]
         assert "Traceback" not in (tmp_path / f"stderr_{other}").read_text()
-    finished(start(data, tmp_path, "shard_map", 2, 2), tmp_path)
-    assert_same_bits(state_of(tmp_path), state_of(undisturbed["2x2"][0]))
+    finished(start(four_shards, tmp_path, "shard_map", 2, 2), tmp_path)
+    assert_same_runs(tmp_path, two_by_two[0])
 
 
 @pytest.mark.slow
 def test_one_process_told_to_end_stops_all_at_the_same_step(
-    data, undisturbed, tmp_path
+    four_shards, two_by_two, tmp_path
 ):
-    workers = start(data, tmp_path, "shard_map", 2, 2, pause_s=1.5)
+    workers = start(four_shards, tmp_path, "shard_map", 2, 2, pause_s=1.5)
     while not (tmp_path / "step_1").exists():
         assert workers[1].poll() is None, lines_of(tmp_path, 1)[-20:]
         time.sleep(0.05)
@@ -182,25 +159,25 @@ def test_one_process_told_to_end_stops_all_at_the_same_step(
     assert steps[0] == steps[1]
     assert 1 <= int(steps[0]) < STEPS
     assert (tmp_path / "checkpoints" / steps[0]).is_dir()
-    finished(start(data, tmp_path, "shard_map", 2, 2), tmp_path)
-    assert_same_bits(state_of(tmp_path), state_of(undisturbed["2x2"][0]))
+    finished(start(four_shards, tmp_path, "shard_map", 2, 2), tmp_path)
+    assert_same_runs(tmp_path, two_by_two[0])
 
 
 @pytest.mark.slow
-def test_killed_processes_resume_to_the_bit(data, undisturbed, tmp_path):
+def test_killed_processes_resume_to_the_bit(four_shards, two_by_two, tmp_path):
     """Both die inside the second epoch, and pass over a damaged checkpoint."""
-    workers = start(data, tmp_path, "shard_map", 2, 2, kill_after=4)
+    workers = start(four_shards, tmp_path, "shard_map", 2, 2, kill_after=4)
     assert workers[0].wait(600) == -signal.SIGKILL
     workers[1].kill()  # it may have lost its peer just before its own signal
     assert workers[1].wait(60) != 0
     assert not list(tmp_path.glob("process_*.json"))
     noted = tmp_path / "checkpoints" / "4" / "position" / "metadata"
     noted.write_bytes(noted.read_bytes()[:-1])
-    again = start(data, tmp_path, "shard_map", 2, 2, in_memory_mb=100.0)
+    again = start(four_shards, tmp_path, "shard_map", 2, 2, in_memory_mb=100.0)
     # the one before is of step 3, at the end of the first epoch
     left = [STEPS - 3] * 2
     assert [process["steps"] for process in finished(again, tmp_path)] == left
-    assert_same_bits(state_of(tmp_path), state_of(undisturbed["2x2"][0]))
+    assert_same_runs(tmp_path, two_by_two[0])
     lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["step"] for line in lines] == list(range(1, STEPS + 1))
     said = [lines_of(tmp_path, number) for number in (0, 1)]
@@ -209,18 +186,16 @@ def test_killed_processes_resume_to_the_bit(data, undisturbed, tmp_path):
 
 
 @pytest.mark.slow
-def test_another_way_of_sharing(data, undisturbed, tmp_path):
-    finished(start(data, tmp_path, "pmap", 2, 2), tmp_path)
-    assert_equal_runs(tmp_path, undisturbed["1x1"][0])
+def test_another_way_of_sharing(four_shards, undisturbed, tmp_path):
+    finished(start(four_shards, tmp_path, "pmap", 2, 2), tmp_path)
+    assert_equals(tmp_path, undisturbed.state)
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
         (("host:1", 2, None), "expected all three or none"),
-        ((None, 2, 1), "expected all three or none"),
         (("host", 2, 1), "coordinator_address: host: expected host:port"),
-        (("host:1", 0, 0), "num_processes: 0: expected >= 1"),
         (("host:1", 2, 2), "process_id: 2: expected 0 to 1"),
     ],
 )

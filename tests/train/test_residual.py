@@ -21,7 +21,6 @@ from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.train.step import init_state, loss_inputs, make_train_step
 from rcirl_jax.types import Tag
 from tests.helpers.stored import rows_of
-from tests.train.test_loop import dataset as dataset  # a fixture
 from tests.train.test_step import SMALL, normaliser
 
 CONFIG = TrainConfig(
@@ -111,13 +110,13 @@ def test_seven_times_the_cost_learns_the_same():
         np.testing.assert_allclose(one, two, rtol=2e-3, atol=2e-4)
 
 
-def test_the_file_says_the_gain_that_was_learned(dataset, tmp_path):
+def test_the_file_says_the_gain_that_was_learned(simulated, tmp_path):
     config = dataclasses.replace(CONFIG, epochs=1, own_unit=0.5)
     config = dataclasses.replace(
         config, residual_on="tests/planner/costs/costs.py:headway_cost"
     )
-    train(dataset, tmp_path / "run", config)
-    reward = export_run(tmp_path / "run", dataset, tmp_path / "w.msgpack")
+    train(simulated, tmp_path / "run", config)
+    reward = export_run(tmp_path / "run", simulated, tmp_path / "w.msgpack")
     beta = float(jnp.exp(restore_run(tmp_path / "run", config).params["log_beta"]))
     prior, own = reward.prior_cost, own_cost(config.residual_on)
     assert prior.incumbent == "headway_cost"

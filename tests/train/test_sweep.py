@@ -1,14 +1,10 @@
 """Sweeps: members are single runs, one compile a group, resume, the choice."""
 
 import dataclasses
-import functools
 import json
 import shutil
-import subprocess
-import sys
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -27,17 +23,13 @@ from rcirl_jax.export.sweep import (
     train_group,
 )
 from rcirl_jax.report.charts import sweep_picture
-from rcirl_jax.reward import CandidateInfo, RewardConfig
 from rcirl_jax.runtime.executors import Processes, Serial
-from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.train import sweep as members_sweep
-from rcirl_jax.train.state import FeatureBatch, TrainConfig
+from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.train.sweep import fit, freeze, members_of
 from rcirl_jax.units import HORIZON_S
-from tests.conftest import REPO
-from tests.data.small_logs import files_of
 from tests.helpers.stored import rows_of, stored
-from tests.train.test_step import SMALL, normaliser
+from tests.train.test_step import SMALL
 
 BASE = TrainConfig(
     batch_size=8, epochs=2, sampler=SMALL, positive="nearest", train_horizon=5.0
@@ -110,74 +102,6 @@ def test_members_equal_single_runs(data, monkeypatch):
     assert len({float(x) for part in parts for x in part.fitted.loss[:, -1]}) == 8
 
 
-def test_a_group_is_one_compile_however_many_chunks(data, monkeypatch):
-    monkeypatch.setattr(sweep, "MEMBERS_AT_ONCE", 3)
-    members_sweep._fit.clear_cache()
-    shapes = {"hidden_sizes": ((7,), (3, 2)), "leaky_rates": (0.05, 0.1, 0.3)}
-    config = config_of(data, seeds=1, **shapes)
-    parts = []
-    for hidden in ((7,), (3, 2)):
-        parts += train_group(of_shape(hidden, config), config)
-    assert [len(part.members) for part in parts] == [3, 3, 3, 3]
-    assert [len(part.compile_s) for part in parts] == [1, 0, 1, 0]
-
-
-def test_many_members_fit():
-    """Microbatches bound what members hold in a step; their number hardly counts."""
-    members, batch_size = 64, 64
-    reward = RewardConfig(hidden=(64,))
-    config = dataclasses.replace(BASE, batch_size=batch_size, reward=reward)
-    who = members_of([config] * members)
-    order = jax.random.key(0)
-    given = (many(64), normaliser(), order, who, config)
-    lowered = members_sweep._fit.lower(*given)
-    held = lowered.compile().memory_analysis().temp_size_in_bytes
-    one_layer = 4 * members * batch_size * 128 * 18 * 64
-    assert one_layer > 2e9
-    assert held < 200e6
-
-
-@functools.cache
-def many(scenes=16, candidates=128):
-    """Made-up features with as many candidates as the default sampler draws."""
-    rng = np.random.default_rng(0)
-    middle, width = normaliser().location, normaliser().scale
-    shape, pairs = (scenes, candidates, 18, middle.size), (scenes, candidates)
-    around = lambda *x: middle + 0.1 * width * rng.normal(size=x)  # noqa: E731
-    distance = jnp.asarray(rng.uniform(0.0, 9.0, pairs), jnp.float32)
-    of_scenes, of_pairs = jnp.zeros(scenes), jnp.zeros(pairs)
-    info = CandidateInfo(
-        human_distance=of_scenes, human_collides=jnp.zeros(scenes, bool),
-        distance=distance, collides=distance > 8.0, breaks_rule=of_pairs,
-        human_density=of_scenes, density=of_pairs, human_own=of_scenes, own=of_pairs,
-    )  # fmt: skip
-    return FeatureBatch(
-        human=jnp.asarray(around(scenes, *shape[2:]), jnp.float32),
-        candidates=jnp.asarray(around(*shape), jnp.float32).transpose(0, 3, 2, 1),
-        feasible=jnp.asarray(rng.random(pairs) < 0.8),
-        time_valid=jnp.ones((scenes, 18), bool),
-        info=info,
-        weight=jnp.ones(scenes),
-        index=jnp.arange(scenes, dtype=jnp.int32),
-    )
-
-
-def test_times_that_no_scene_compares_change_nothing():
-    made = many()
-    early = jnp.arange(18) < 7
-    masked = made.replace(time_valid=made.time_valid & early)
-    loud = masked.replace(
-        candidates=jnp.where(early[:, None], made.candidates, 1e3),  # [.., T, K]
-        human=jnp.where(early[:, None], made.human, -1e3),
-    )
-    config = dataclasses.replace(BASE, epochs=1)
-    a = fit(masked, normaliser(), config, members_of([config]))
-    b = fit(loud, normaliser(), config, members_of([config]))
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_array_equal(x, y)
-    assert np.isfinite(np.asarray(a.loss)).all()
-
-
 def test_everything_is_written_and_loads(finished, tmp_path):
     folder, report = finished
     assert json.loads((folder / "sweep.json").read_text()) == report
@@ -244,50 +168,10 @@ def test_other_settings_or_data_in_the_folder_are_one_line(data, finished):
         run_sweep(config_of(data, base=longer), folder, Serial(), {})
 
 
-def test_a_sweep_in_use_is_refused(data, finished):
-    folder = finished[0]
-    with only_one(folder):
-        before = files_of(folder)
-        with pytest.raises(InputError, match="in use by another proc"):
-            run_sweep(config_of(data), folder, Serial(), MADE_BY)
-        assert files_of(folder) == before
-
-
-RAY = """
-import sys
-from pathlib import Path
-import ray
-from rcirl_jax.runtime.executors import Ray
-from rcirl_jax.export.sweep import run_sweep
-from tests.train.test_sweep import MADE_BY, config_of
-ray.init(num_cpus=2, log_to_driver=False, logging_level="ERROR")
-run_sweep(config_of(sys.argv[1]), Path(sys.argv[2]), Ray("auto"), MADE_BY)
-ray.shutdown()
-"""
-
-
-def on_ray(data, folder):
-    pytest.importorskip("ray")
-    done = subprocess.run(
-        [sys.executable, "-c", RAY, str(data), str(folder)],
-        capture_output=True, text=True, timeout=500, check=False, cwd=REPO,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-2000:]
-
-
-def in_processes(data, folder):
-    run_sweep(config_of(data), folder, Processes(2), MADE_BY)
-
-
 @pytest.mark.slow
 @pytest.mark.multiprocess
-@pytest.mark.parametrize(
-    "elsewhere", [in_processes, pytest.param(on_ray, marks=pytest.mark.ray)]
-)
-def test_the_result_does_not_depend_on_the_executor(
-    data, finished, tmp_path, elsewhere
-):
-    elsewhere(data, tmp_path)
+def test_the_result_does_not_depend_on_the_executor(data, finished, tmp_path):
+    run_sweep(config_of(data), tmp_path, Processes(2), MADE_BY)
     there = json.loads((tmp_path / "sweep.json").read_text())
     assert untimed(there) == untimed(finished[1])
     for name in there["members"]:
@@ -347,9 +231,7 @@ def test_validation_shares_no_vehicle_with_the_fit(data):
     ("changes", "message"),
     [
         ({"leaky_rates": (0.05, 0.05)}, "twice: expected distinct values"),
-        ({"leaky_rates": (1.5,)}, "leaky_rate: 1.5: expected between 0 and 1"),
         ({"hidden_sizes": ()}, "hidden_sizes: .*: expected one value or more"),
-        ({"seeds": 0}, "seeds: 0: expected >= 1"),
         ({"validation": 0.9}, "validation: 0.9: expected 0 to 0.5"),
         ({"choose_by": "luck"}, "choose_by: luck: expected one of"),
         (

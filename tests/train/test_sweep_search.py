@@ -10,7 +10,6 @@ from rcirl_jax.export import sweep
 from rcirl_jax.export.sweep import ROUND, Point, read_sweep, rounds, run_sweep, table
 from rcirl_jax.report.charts import sweep_picture
 from rcirl_jax.runtime.executors import Serial
-from tests.helpers.commands import refused
 from tests.train.test_sweep import MADE_BY, config_of, data, untimed
 
 pytest.importorskip("optuna")
@@ -94,13 +93,6 @@ def test_nothing_to_search_is_one_line():
     one = {"hidden_sizes": ((),), "leaky_rates": (0.1,), "learning_rates": (0.01,)}
     with pytest.raises(InputError, match=r"trials: .*: expected two values"):
         config(**one)
-
-
-@pytest.mark.multiprocess
-def test_trials_of_a_grid_are_one_line(tmp_path):
-    given = (f"--data={tmp_path}", f"--output={tmp_path}/out", "--trials=9")
-    said = refused("rcirl_jax", "sweep", *given)
-    assert "--trials: 9: expected --search=optuna" in said
 
 
 def test_without_optuna_the_extra_is_named(monkeypatch):

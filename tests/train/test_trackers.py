@@ -36,12 +36,6 @@ def events(folder: Path) -> list:
     return [Event.FromString(bytes(r)) for path in files for r in read_records(path)]
 
 
-def test_settings_are_one_level():
-    assert SETTINGS["reward.activation"] == TrainConfig().reward.activation
-    assert SETTINGS["batch_size"] == TrainConfig().batch_size
-    assert SETTINGS["reward.hidden"] == str(TrainConfig().reward.hidden)
-
-
 def test_tensorboard(tmp_path):
     track("tensorboard", tmp_path)
     found = events(tmp_path / "tensorboard")

@@ -6,10 +6,11 @@ import signal
 import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 import jax
 
-from rcirl_jax.data.store import batches as pipeline
+from rcirl_jax.data.store import batches
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.runtime.signals import Interrupted
 from rcirl_jax.sampling import SamplerConfig
@@ -25,6 +26,12 @@ CONFIG = TrainConfig(
     learning_rate=0.1,
     sampler=SamplerConfig(num_random=4, cruise_times=(4.0,), edge_times=(4.0,)),
 )
+
+
+def trained(dataset, workdir, **running):
+    """The result of a training whose rows slide through a window of half of them."""
+    with mock.patch.object(batches, "WINDOW_BLOCKS", 2):
+        return train(dataset, workdir, CONFIG, running=Running(**running))
 
 
 def main():
@@ -43,15 +50,11 @@ def main():
                 time.sleep(0.02)
             os.kill(os.getpid(), signal.SIGKILL)
 
-    pipeline.WINDOW_BLOCKS = 2  # half of the test's data: rows slide through it
-    running = Running(
-        parallel=job["parallel"],
-        in_memory_mb=job["in_memory_mb"],
-        checkpoint_every=2,
-        on_step=on_step,
-    )
     try:
-        result = train(open_dataset(job["data"]), workdir, CONFIG, running=running)
+        result = trained(
+            open_dataset(job["data"]), workdir, parallel=job["parallel"],
+            in_memory_mb=job["in_memory_mb"], checkpoint_every=2, on_step=on_step,
+        )  # fmt: skip
     except Interrupted as stop:
         sys.exit(128 + stop.number)
     seen = {
