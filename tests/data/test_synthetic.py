@@ -167,10 +167,6 @@ def test_lane_changes_happen_and_are_smooth(default):
     assert sum(abs(track.y[-1] - track.y[0]) > 2.5 for track in tracks) > 30
 
 
-SAME = {"headway_s": 1.3, "jam_gap_m": 2.0}
-SAME |= {"acceleration_mps2": 1.8, "deceleration_mps2": 2.0}
-
-
 @pytest.mark.parametrize(
     ("old", "new", "field"),
     [

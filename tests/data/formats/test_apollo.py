@@ -6,7 +6,6 @@ import re
 import numpy as np
 import pytest
 
-from rcirl_jax.data.formats import messages as drives
 from rcirl_jax.data.formats import parts, read_recordings
 from rcirl_jax.types import Kind
 from tests.data.formats.fixtures import apollo as fixture
@@ -160,10 +159,7 @@ def destinations(recording):
     [
         *[
             (f"/apollo/{name}", fixture.CHANNELS[ROUTING], fixture.routing)
-            for name in (
-                *("routing_response", "routing_response_history"),
-                *("raw_routing_response", "raw_rrouting_response_history"),
-            )
+            for name in ("routing_response", "raw_rrouting_response_history")
         ],
         # Apollo 9 and later; a record from mid-drive has the history alone
         *[
@@ -226,61 +222,3 @@ def test_of_a_silent_chassis_nobody_knows_the_mode(tmp_path):
         np.testing.assert_allclose(ego.automated, spans)
     (ego,) = only(tmp_path, ego_only()).tracks
     assert ego.automated == ()
-
-
-# --------------------------------------------------------------- long drives
-
-
-def long_drive(seconds=100.0):
-    """Two cars ahead; one is hidden from 45 to 47 s, across a border of windows."""
-    sent = [(ROUTING, 0.0, fixture.routing(*place(0)))]
-    if seconds > 61.0:
-        sent.append((ROUTING, 61.0, fixture.routing(*place(900))))
-    for k in range(round(10 * seconds) + 1):
-        t = 0.1 * k
-        sent.append((LOCALIZATION, t, fixture.localization(t)))
-        seen = ["12"] if 45.0 < t < 47.0 else ["12", "17"]
-        users = fixture.road_users(np.array([t]))
-        items = [fixture.obstacle(name, users[name], t) for name in seen]
-        content = fixture.perceived(t, items)
-        sent.append((PERCEPTION, t + fixture.LATE_S, content))
-    return sorted(sent, key=lambda item: item[1])
-
-
-@pytest.fixture(scope="module")
-def long():
-    """The messages of a long drive."""
-    return long_drive()
-
-
-@pytest.fixture
-def in_pieces(monkeypatch):
-    """Rows are handed on every five seconds."""
-    monkeypatch.setattr(drives, "PIECE_S", 5.0)
-
-
-def in_parts(folder, sent, count):
-    """Files of a drive; the first."""
-    size = -(-len(sent) // count)
-    for part in range(count):
-        some = sent[part * size : (part + 1) * size]
-        write(folder / f"a.record.{part:05d}", some)
-    return folder / "a.record.00000"
-
-
-@pytest.mark.usefixtures("in_pieces")
-def test_long_drive_is_read_in_windows(tmp_path, long):
-    path = in_parts(tmp_path, long, 4)
-    (whole,) = read(path)
-    found = read(path, window_s=20.0)
-    assert [made.scenes_within[0] for made in found] == [0.0, 20.0, 40.0, 60.0, 80.0]
-    ego = tracks_of(found[2])["ego"]
-    assert (ego.t[0], ego.seen_since) == (pytest.approx(35.0), 0.0)
-    assert destinations(found[2]) == {"ego": place(0), "ego-leg2": place(900)}
-    assert destinations(found[4]) == {"ego-leg2": place(900)}
-    assert "17#2" in tracks_of(found[4])
-    one, apart = logs.scenes_of([whole], 5.2), logs.scenes_of(found, 5.2)
-    assert len(one) > 400
-    assert set(apart) == set(one)
-    for key, stations in one.items():
-        np.testing.assert_allclose(apart[key], stations, atol=2e-2)

@@ -19,7 +19,7 @@ import pytest
 
 from rcirl_jax.data.formats.csv.columns import CONVENTIONS
 from tests.data.formats import people
-from tests.data.formats.people import HEADER, LONG, Way, column, of, rows, text
+from tests.data.formats.people import HEADER, Way, column, of, rows, text
 
 # ----------------------------------------------------------------------- layouts
 
@@ -198,11 +198,11 @@ COLUMNAR = {
         content=stored(write, **changed),
         place=0.02 if name == "single precision" else 0.002,
     )
-    for form, write in (
-        ("Parquet", pq.write_table),
-        ("Feather", pyarrow.feather.write_feather),
+    for form, write, types in (
+        ("Parquet", pq.write_table, TYPES),
+        ("Feather", pyarrow.feather.write_feather, {"as they are": {}}),
     )
-    for name, changed in TYPES.items()
+    for name, changed in types.items()
 }
 
 # ------------------------------------------------------------------------- times
@@ -323,7 +323,7 @@ HEADINGS = {
     f"{convention} {unit} {turn} {said}": headed(convention, unit, turn, more)
     for convention in CONVENTIONS
     for unit in ("rad", "deg")
-    for turn in (0.5, -2.0)
+    for turn in (-2.0,)
     for said, more in (
         ("unit said", ""),
         ("nothing said", None),
@@ -405,10 +405,11 @@ WAYS = {
 }
 
 
-@LONG
 @pytest.mark.parametrize("name", WAYS)
-def test_the_same_drive(tmp_path, name, long_bytes):
+def test_the_same_drive(tmp_path, name):
+    """Every other one read in pieces, as a long file is."""
     way = WAYS[name]
+    long_bytes = 1 if list(WAYS).index(name) % 2 else 10**9
     found = people.only(*people.put(tmp_path, way, f"long_bytes = {long_bytes}"))
     near = {"place": way.place, "angle": way.angle, "speed": way.speed}
     people.assert_same(found, way.turn, **near)

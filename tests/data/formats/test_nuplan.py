@@ -71,9 +71,7 @@ def test_ego_is_the_box_at_the_clouds_time(whole, log):
 @pytest.mark.parametrize(
     ("name", "drive"),
     [
-        (fixture.NAME, DRIVE),
         ("2021.06.14.21.57.33_veh-08_01008_01518", "2021.06.14.21.57.33_veh-08"),
-        ("my_log_00001_00002", "my_log_00001_00002"),
         (f"{DRIVE}_00017", f"{DRIVE}_00017"),
     ],
 )
@@ -119,13 +117,10 @@ def test_stop_lines_signs_and_lights(whole):
 @pytest.mark.parametrize(
     ("version", "location", "is_found"),
     [
-        ("us-nv-las-vegas-strip", "x", True),
         ("us-nv-las-vegas-strip.gpkg", "x", True),
         (None, "las_vegas", True),
-        ("nuplan-maps-v1.0", "us-nv-las-vegas-strip", True),
         # what leaves the folder, or could be several maps
-        *[(name, "/etc", False) for name in ("../maps/us-nv-las-vegas-strip", "..")],
-        *[(name, "/etc", False) for name in ("", "us-")],
+        *[(name, "/etc", False) for name in ("../maps/us-nv-las-vegas-strip", "us-")],
     ],
 )
 def test_map_is_found_by_name(folder, version, location, is_found):
@@ -155,7 +150,6 @@ def in_utm(points):
     ("srs", "to", "zone"),
     [
         (32611, in_utm, "epsg:32611"),
-        (32611, in_utm, "EPSG:32611"),
         (26911, in_utm, "epsg:32611"),
         (4326, fixture.degrees, "26911"),
     ],
@@ -213,15 +207,9 @@ def test_geometries(content, points):
     np.testing.assert_array_equal(geopackage.points_of(content), points)
 
 
-NESTED = blob(shapely.GeometryCollection([shapely.MultiLineString([SHORT])]))
 MALFORMED = [
-    *(None, "GP", b"", b"XX" + bytes(20)),
-    b"GP\x00\x0f" + bytes(40),  # no such envelope
-    blob(shapely.Point(1.0, 2.0)),
-    *(blob(LONG)[:cut] for cut in (9, 12, 30)),
-    # more points, rings or lines than there are bytes
-    *(blob(shape)[:13] + b"\xff" * 4 for shape in (LONG, shapely.Polygon(RING))),
-    NESTED[:9] + b"\x05" + NESTED[10:],  # lines of lines
+    *(None, b"XX" + bytes(20), blob(shapely.Point(1.0, 2.0)), blob(LONG)[:30]),
+    blob(LONG)[:13] + b"\xff" * 4,  # more points than there are bytes
 ]
 
 

@@ -127,12 +127,8 @@ def entry(key, value):
 
 BAD_SHARDS = [
     (entry("../../../secret", X), r"files: '../../../secret': expected two of every"),
-    (entry("a\nb", X), r"files: 'a\\nb': expected two of every array"),
-    (entry("\ud800", X), "not JSON"),
     # zarr reads zeros where nothing is
     (entry(ROWS, None), f"files: '{ROWS}': expected two of every array"),
-    (entry(ROWS, {"bytes": 0, "sha256": "missing"}), "files.*: expected a text"),
-    (entry(ROWS, X | {"bytes": True}), "files.*: expected a whole number"),
     (entry(ROWS, X), f"files: {ROWS}: 1 bytes: expected 20 at least for 2 rows"),
     # an array of a billion rows is not made of a small file
     (lambda s: s.update(count=10**9), "bytes: expected 62500004 at least for 10"),
@@ -151,18 +147,13 @@ GROUPS, FLOAT32 = "splits: .*expected every group", ".*float64.*expected .*float
 BAD_MANIFESTS = [
     (lambda m: m.update(schema_version=1), "schema_version: 1: expected 2"),
     (lambda m: m.pop("quality"), "quality: missing: expected"),
-    (lambda m: m["arrays"].pop("human.s"), "arrays: human.s: None: expected"),
     (lambda m: m["arrays"]["human.s"].update(dtype="float64"), FLOAT32),
     (lambda m: m["time_grid_s"].pop(), "time_grid_s"),
     (lambda m: (m["shards"][0].update(count=3), m.update(count=3)), "shard 0: float32"),
-    (lambda m: m.update(count=-1), "count: -1: expected a whole number >= 0"),
     (lambda m: m.update(count=1), "count: 1: expected 2, the sum of its shards"),
     (lambda m: m.update(count=10**15), "count: 10{15}: expected a whole number <="),
-    (lambda m: m.update(count=2**31 + 1), "count: .*: expected a whole num"),
     (lambda m: m["splits"].popitem(), GROUPS),
     (lambda m: m["splits"].update(a=["g0"]), GROUPS),
-    (lambda m: m["splits"].update(a=["odd"]), GROUPS),
-    (lambda m: m["sources"].append({"\udfff": 1}), "not JSON"),
 ]
 
 
