@@ -1,8 +1,4 @@
-"""The plan of each recording's site, kept with a dataset so that a person can look.
-
-A dataset holds scenes along drivers' own ways. Whether the roads under them are right
-is seen on a plan alone: lanes, directions, limits, stop lines, and where cars drove.
-"""
+"""The plan of each recording's site, kept with a dataset so that a person can look."""
 
 import itertools
 from collections.abc import Mapping

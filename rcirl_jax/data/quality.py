@@ -192,12 +192,9 @@ class QualityReport:
 
 
 def merged_notes(notes: Sequence[tuple[str, str]]) -> list[str]:
-    """Returns notes as lines: equal ones of several recordings as one.
+    """Returns notes (recording, note) as lines; equal ones are one line.
 
     What stands first among the notes of a recording comes first.
-
-    Args:
-      notes: (name of the recording, note), in the order of the recordings.
     """
     ranks: dict[str, int] = {}
     met: Counter = Counter()

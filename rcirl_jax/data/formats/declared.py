@@ -1,8 +1,4 @@
-"""Formats of tables, declared: which columns they have, and what their cells are.
-
-A format states its columns as field -> kind of cells (`tables.table.LIMITS`); what is
-odd about it is a short hook of its reader.
-"""
+"""Formats of tables, declared: field -> kind of cells (`tables.table.LIMITS`)."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -50,13 +46,7 @@ def over_packaged(spec: dict, packaged: Mapping, free: Collection[str]) -> dict:
 def open_log(
     path: Path, spec: Mapping, known: Collection[str] = ()
 ) -> tuple[Table, RowStats]:
-    """Opens a table as its source TOML says, and counts of its rows.
-
-    Args:
-      path: file.
-      spec: source TOML.
-      known: names that the table should hold, which may tell its encoding.
-    """
+    """Opens a table, which should hold `known` names; counts of its rows."""
     table = open_table(path, section(spec, "table"), known)
     return table, RowStats(path=path, unit=table.unit, allowed=allowed_share(spec))
 
@@ -80,9 +70,7 @@ def read_log(
 def size_of(rows: Rows, usual: Sequence[float]) -> tuple[float, float, bool]:
     """Returns medians [m] of the known lengths and widths, and whether one is assumed.
 
-    Args:
-      rows: perhaps length and width [n] m; NaN, and 0, is unknown.
-      usual: m, length and width where no row says them.
+    NaN, and 0, is unknown; `usual` is taken where no row says them.
     """
     known = [rows.get(field, np.zeros(0)) for field in ("length", "width")]
     known = [sizes[sizes > 0.0] for sizes in known]  # NaN is not
@@ -108,8 +96,7 @@ def track_of(
 
     Args:
       name: of the track.
-      rows: t [s], x, y [m] and, if known, heading [rad], speed [m/s], length, width
-        [m], [n] each; NaN is unknown.
+      rows: t [s], x, y [m], perhaps heading [rad], speed [m/s], length, width [m].
       kind: of the road user.
       usual: m, its length and width where no row says them.
       standing: rad, heading of one that never moves, and has no other.

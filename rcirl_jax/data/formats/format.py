@@ -1,7 +1,4 @@
-"""The declaration of a format, which loads none of its reader.
-
-Each folder with a `reader` has a `FORMAT` in its `__init__`, which is cheap to import.
-"""
+"""The declaration of a format, which loads none of its reader."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -1,8 +1,4 @@
-"""Lanes of logs without a map: the source TOML's, or straight ones.
-
-Straight lanes are parallel to the x axis, one for each lane number. `data.roads` finds
-the others in the tracks.
-"""
+"""Lanes of logs without a map: the source TOML's, or straight ones along x."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -167,11 +163,7 @@ def parallel_lane(
 ) -> Lane:
     """Returns a lane parallel to the x axis, driven the way that it is.
 
-    Args:
-      lane: where it lies.
-      sides: m, from the centre line to the left and right bound.
-      beside: ids of the lanes to the left and to the right.
-      limit: m/s, or None.
+    `sides` m: from the centre line to the bounds; `beside`: ids of the lanes there.
     """
     steps = int((lane.upper - lane.lower) / LANE_STEP_M)
     x = np.linspace(lane.lower, lane.upper, steps + 2)

@@ -243,11 +243,7 @@ def _is_possible(track: Track) -> bool:
 def placed(
     tracks: Sequence[Track],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Track]]:
-    """Moves tracks to a local origin.
-
-    Returns:
-      x, y [n] m of all samples as they were, the origin [2] m, the tracks around it.
-    """
+    """Returns x, y [n] m as they were, a local origin [2] m, tracks around it."""
     x = np.concatenate([track.x for track in tracks])
     y = np.concatenate([track.y for track in tracks])
     origin = local_origin(x, y)
@@ -273,13 +269,9 @@ def fitted_lanes(
 def held_states(
     clock: np.ndarray, seen: np.ndarray, states: np.ndarray, hold: float
 ) -> np.ndarray:
-    """Holds the last state seen of a light: [T] numbers of STATES.
+    """Returns [T] numbers of STATES: the last state [n] seen of a light.
 
-    Args:
-      clock: [T] times, increasing.
-      seen: [n] times, increasing, in the same unit.
-      states: [n] numbers of STATES.
-      hold: in the same unit; the light is off after it without any.
+    All times are in one unit; the light is off after `hold` without any.
     """
     last = np.searchsorted(seen, clock, side="right") - 1
     fresh = (last >= 0) & (clock - seen[np.maximum(last, 0)] <= hold)

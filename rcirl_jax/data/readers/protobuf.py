@@ -1,8 +1,7 @@
 """Messages read by the protobuf library, with short schemas instead of .proto files.
 
-A schema names the fields that are read; the library skips all others, and those of
-another wire type. Parsed messages take up to 60 times the bytes of a file made for
-it, so callers limit these first. The library itself refuses 100 nested messages.
+A schema names the fields that are read; the library skips all others. Parsed messages
+take up to 60 times the bytes of a file made for it, so callers limit these first.
 """
 
 import itertools

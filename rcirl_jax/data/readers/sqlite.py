@@ -1,10 +1,9 @@
 """SQLite files of others, opened by Python's sqlite3 for reading only, in bounded work.
 
-A database can make its reader run code: views may recurse without end, generated
-columns and triggers call functions, and every cell may have any type. So the file is
-opened immutable, only tables are read, only SELECT is authorised, schema functions are
-not trusted, values are short, and the virtual machine stops after a number of steps in
-proportion to the file's size.
+A database can make its reader run code (views, generated columns, triggers). So the
+file is opened immutable, only tables are read, only SELECT is authorised, schema
+functions are not trusted, values are short, and the virtual machine stops after a
+number of steps in proportion to the file's size.
 """
 
 import sqlite3

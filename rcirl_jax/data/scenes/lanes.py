@@ -297,10 +297,7 @@ class LaneGraph:
     ) -> np.ndarray:
         """Returns m by which the road is narrower on a side, where a lane has ended.
 
-        Args:
-          lanes: of the chain.
-          side: "left" or "right".
-          parts: points of the line before the chain, of its lanes, and beyond.
+        `parts` are points of the line before the chain, of its `lanes`, and beyond.
         """
         found = [np.zeros(len(part)) for part in parts]
         for lane, number in ((lanes[0], 0), (lanes[-1], -1)):

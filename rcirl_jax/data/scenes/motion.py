@@ -52,9 +52,8 @@ def human_motion(driver: Driver, start: int, length: float) -> dict | None:
 
     Returns:
       Fields of a row: "ego.*"; "human.s" since the frame, continued at constant speed
-      after the future, and "human.l" [T] m; "time_valid" [T]; "future_s", recorded
-      after the frame, <= 8 s; "s_at_5s" m; "s0" m, the frame's station. None if the
-      driver leaves the chain's stations.
+      after the future, and "human.l" [T] m; "time_valid" [T]; "future_s", "s_at_5s" m;
+      "s0" m, the frame's station. None if the driver leaves the chain's stations.
     """
     future = driver.s[start:]
     within = future[: int(HORIZON_S * driver.rate) + 2]

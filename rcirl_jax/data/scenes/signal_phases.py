@@ -5,8 +5,7 @@ moved by every offset d of the cycle, and the agreement
 
     A(d) = (crossings not on red + stands on red) / (crossings + stands)
 
-is looked for at one common offset of all recordings of a signal. A phase that
-means nothing is as good as any other, whatever the platoons; its p value is the
+is looked for at one common offset of all recordings of a signal. Its p value is the
 share of random turns, one per recording, that agree at least as well as what is
 written. A stand is a car at rest, first before the line. Right turns are counted
 apart: where these data come from they may cross on red.
@@ -50,11 +49,7 @@ class Event:
     signals: tuple[Signal, ...]  # that govern the line; any of them may allow
 
     def state(self, offset: float) -> str:
-        """Return the line's most permissive colour, its cycles moved by `offset` s.
-
-        Whether a car goes straight or turns is not known. A dark signal (an
-        arrow that is off) leaves the word to the others.
-        """
+        """Return the line's most permissive colour, its cycles moved by `offset` s."""
         states = set()
         for signal in self.signals:
             cycle, first, time = period(signal), float(signal.start[0]), self.time
@@ -190,15 +185,7 @@ def check_events(recorded: Iterable[LineEvents]) -> list[PhaseCheck]:
 def check_written(
     parts: Sequence[InputFile], *, executor: Executor | None = None
 ) -> list[PhaseCheck]:
-    """Recorded signals checked against all drivers of the logs, line by line.
-
-    Args:
-      parts: of `importers.parts`.
-      executor: where they are read; default: this process. Changes no number.
-
-    Raises:
-      InputError: logs that cannot be read.
-    """
+    """Checks the recorded signals against all drivers of the logs, line by line."""
     places = executor or Serial()
     return check_events(places.stream(_line_events, work_units(parts, places.workers)))
 
@@ -250,9 +237,7 @@ def _check(name: str, found: Sequence[tuple[str, Event]]) -> PhaseCheck:
 def _p_value(agree: np.ndarray, where: Sequence[str]) -> float:
     """Share of random turns, one per recording, as good as the written phase.
 
-    Args:
-      agree: [offsets, events] bool; the first offset is the written phase.
-      where: [events] recording of each.
+    `agree` [offsets, events], the first offset being the written one; `where` [events].
     """
     rng = np.random.default_rng(0)
     names = np.array(where, object)

@@ -145,14 +145,8 @@ class SmoothTrack:
 def smooth_track(track: Track, rate_hz: float, window_s: float) -> SmoothTrack:
     """Resample to the uniform clock and smooth positions (Savitzky-Golay).
 
-    Args:
-      track: any track with at least one sample.
-      rate_hz: the clock, 1/s.
-      window_s: length of the filter window, s; tracks shorter than the window
-        get the longest odd window that fits, or none below 5 samples.
-
-    Returns:
-      The smoothed track; gaps are bridged linearly.
+    Gaps are bridged linearly; tracks shorter than the window [s] get the longest odd
+    one that fits, or none below 5 samples.
     """
     first = int(round(track.t[0] * rate_hz))
     last = int(round(track.t[-1] * rate_hz))
@@ -199,10 +193,7 @@ def _filters(window: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def harsh_share(x: np.ndarray, y: np.ndarray, rate_hz: float) -> tuple[int, int]:
-    """Return how many accelerations exceed HARSH_MPS2 in magnitude, and of how many.
-
-    a = d(speed)/dt with the speed from differences of positions.
-    """
+    """Return how many |d(speed)/dt| exceed HARSH_MPS2, and of how many."""
     if x.size < 3:
         return 0, 0
     speed = np.hypot(np.diff(x), np.diff(y)) * rate_hz

@@ -35,9 +35,7 @@ def epoch_order(seed: int, epoch: int, blocks: np.ndarray) -> np.ndarray:
         key(row) = place(block of row) + WINDOW_BLOCKS * u(row),   u ~ U(0, 1)
 
     sorted by key, `place` being a permutation of the blocks: a window slides over
-    shuffled blocks, so that a block is needed for a while, once an epoch. Rows of
-    a batch come from WINDOW_BLOCKS blocks, fewer at both ends of an epoch. When
-    there are no more blocks than that, the order is a permutation of all rows.
+    shuffled blocks, so that a block is needed for a while, once an epoch.
 
     Args:
       seed: of the run.
@@ -162,17 +160,13 @@ class BatchIterator:
         """Starts at epoch 0, position 0.
 
         Args:
-          rows: those to visit, numpy leaves [m, ...], or the dataset, which is read
-            as the batches need it.
+          rows: those to visit, numpy leaves [m, ...], or the dataset, read as needed.
           numbers: [m] their numbers in the dataset.
           blocks: [m] block of each. Equal blocks, equal order.
           batch_size: rows of a batch over all processes.
           seed: of the order of rows, >= 0.
           shard_index: number of this process.
           num_shards: number of processes; divides `batch_size`.
-
-        Raises:
-          InputError: no rows, or a batch size or seed out of range.
         """
         self._rows, self._numbers = rows, numbers
         self._blocks = np.unique(blocks, return_inverse=True)[1].astype(np.int32)
@@ -200,12 +194,7 @@ class BatchIterator:
         return {"epoch": self._epoch, "position": self._position, "seed": self._seed}
 
     def restore(self, state: Mapping[str, int]) -> None:
-        """Continues as the iterator that gave `state` would have.
-
-        Raises:
-          InputError: the state is of another seed, or lies outside an epoch of
-            these rows.
-        """
+        """Continues as the iterator that gave `state` would have."""
         epoch, position = state.get("epoch", -1), state.get("position", -1)
         inside = epoch >= 0 and 0 <= position < self.batches_per_epoch
         if not inside or state.get("seed") != self._seed:

@@ -257,11 +257,7 @@ class Dataset(Demonstrations):
         return f"Dataset({self._files.name}: {scenes} of {recordings})"
 
     def __getitem__(self, row: int) -> Demonstration:
-        """Returns one row; numpy leaves without the row's axis.
-
-        Raises:
-          IndexError: no such row.
-        """
+        """Returns one row; numpy leaves without the row's axis."""
         return jax.tree.map(lambda leaf: leaf[0], self.read(np.array([row])))
 
     @property
@@ -275,11 +271,7 @@ class Dataset(Demonstrations):
         return self.manifest.count
 
     def write_facts(self, body: Mapping[str, object]) -> None:
-        """Writes beside the manifest what made the dataset: commit, versions, flags.
-
-        Raises:
-          OSError: the place cannot be written.
-        """
+        """Writes beside the manifest what made the dataset: commit, versions, flags."""
         text = json.dumps(plain(body), indent=2, allow_nan=False) + "\n"
         self._files.write_many({FACTS: text.encode()})
 
@@ -288,11 +280,7 @@ class Dataset(Demonstrations):
         return self._body(FACTS, dict[str, Any], b"{}")
 
     def write_plans(self, plans: Sequence[Mapping[str, object]]) -> None:
-        """Writes the plans of sites (`data.plans.plan_of`) beside the manifest.
-
-        Raises:
-          OSError: the place cannot be written.
-        """
+        """Writes the plans of sites (`data.plans.plan_of`) beside the manifest."""
         text = json.dumps(plain(plans), allow_nan=False) + "\n"
         self._files.write_many({PLANS: text.encode()})
 

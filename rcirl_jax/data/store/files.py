@@ -57,11 +57,7 @@ class Files:
             ) from error
 
     def alone(self) -> contextlib.AbstractContextManager[None]:
-        """Holds the folder for this process; remote places cannot be held.
-
-        Raises:
-          InputError: another process holds the folder.
-        """
+        """Holds the folder for this process; remote places cannot be held."""
         if self.folder is None:
             return contextlib.nullcontext()
         return only_one(Path(self.folder))
@@ -81,11 +77,7 @@ class Files:
             ) from error
 
     def list_keys(self) -> list[str]:
-        """Returns all keys below the dataset, but for the lock of who writes it.
-
-        Raises:
-          InputError: one is no text.
-        """
+        """Returns all keys below the dataset, but for the lock of who writes it."""
         try:
             found = [key.decode() for key in self.wait(self.kv.list(), "")]
         except UnicodeDecodeError as error:

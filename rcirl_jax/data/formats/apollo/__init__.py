@@ -1,7 +1,4 @@
-"""Apollo cyber records: `records` is the file, `reader` makes recordings of it.
-
-A new channel or message field is read in `reader`.
-"""
+"""Apollo cyber records: `records` is the file, `reader` makes recordings of it."""
 
 from rcirl_jax.data.formats.format import Format
 

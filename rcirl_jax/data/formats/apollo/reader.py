@@ -1,20 +1,16 @@
 """Baidu Apollo's cyber records: localization, chassis, obstacles, routing.
 
 Read: `*.record`, `*.record.00000`, `.00001`, ... of Apollo 3.5 and later; the
-parts of one drive make one Recording, or one per window of a long drive, made
-while they are read. Messages are parsed by the numbers of their fields, which are
-the same in all releases (modules/common_msgs in the Apollo sources:
-localization.proto, chassis.proto, perception_obstacle.proto,
-prediction_obstacle.proto, routing.proto, planning_command.proto).
+parts of one drive make one Recording, or one per window of a long drive. The
+numbers of the messages' fields are those of modules/common_msgs in the Apollo
+sources, the same in all releases.
 
 Traps: a pose is that of the rear axle's centre, not of the box; the quaternion's
 zero is north, the heading's is east; messages are irregular and on clocks of
 their own, so everything is put on one uniform clock; where perception recorded
 nothing, prediction repeats its obstacles; a drive may be the planner's own, not
-a human's (a note says how much of it); a drive may have several destinations,
-and the ego is another track from each new one on.
-
-A new field of a message stands in SCHEMA, a new channel or message in TOPICS.
+a human's; a drive may have several destinations, and the ego is another track
+from each new one on.
 """
 
 import dataclasses

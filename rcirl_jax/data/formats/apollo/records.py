@@ -1,11 +1,9 @@
 """Records of Apollo's middleware Cyber RT: files, sections, channels, messages.
 
 Layout: cyber/proto/record.proto and cyber/record/file in the Apollo sources. A
-file is a row of sections, each with a head of 16 bytes (type int32, 4 bytes
-unused, size int64). The header's section takes 2048 bytes, however short the
-header is. Channels bring the type of their messages, chunk bodies hold the
-messages. The index at the end is not needed: sections are walked from the start,
-so records that were never closed can be read as well.
+section has a head of 16 bytes (type int32, 4 bytes unused, size int64); that of the
+header takes 2048 bytes, however short the header is. Sections are walked from the
+start and not by the index, so records that were never closed can be read as well.
 """
 
 import mmap

@@ -9,12 +9,9 @@ radians counter-clockwise.
 Traps: the files hold no box sizes, so these come by type from the source TOML;
 `left_neighbor_id` of a map may name an oncoming lane; tracks of category
 "fragment" are of low quality; scenarios cut from one slice of a drive share
-vehicles, so the slice is the vehicle-disjoint group.
-
-Every lane segment of a map has a left and a right boundary in driving direction; the
-centre line lies midway between them, as in the data set's own devkit. Maps of the
-motion data set also hold a `centerline`, those of the sensor data set do not; it is
-not read. There are no speed limits, signals or stop lines.
+vehicles, so the slice is the vehicle-disjoint group. The centre line of a lane lies
+midway between its boundaries, as in the data set's own devkit. There are no speed
+limits, signals or stop lines.
 """
 
 import collections

@@ -1,9 +1,7 @@
 """CommonRoad lanelets -> Lanes: centre lines, widths, limits, stop lines.
 
-The ids of signs are those of CommonRoad's own tables (`TrafficSignID...` of
-commonroad-io and of its environment model), which are the ones of the countries' road
-traffic acts. CommonRoad's default country and those without a table of their own use
-the German ids.
+The ids of signs are those of the countries' road traffic acts (`TrafficSignID...` of
+commonroad-io); countries without a table of their own use the German ids.
 """
 
 import collections

@@ -1,7 +1,6 @@
 """CommonRoad scenario XML, versions 2020a and 2018b.
 
-The XML is parsed with entities, DTDs and external references forbidden. Every
-obstacle becomes a Track, every lanelet a Lane, every traffic light a Signal of
+Every obstacle becomes a Track, every lanelet a Lane, every traffic light a Signal of
 the schedule written in the file, every planning problem a MissingAgent (the converter
 removed that car from the traffic).
 """
@@ -264,10 +263,7 @@ def _position(state: Node) -> tuple[float, float]:
 
 
 def _middle(place: Node) -> tuple[float, float] | None:
-    """(x, y) m in the middle of the shapes of a position; None without any.
-
-    The mean of the centres of rectangles and circles, and of polygons' corners.
-    """
+    """(x, y) m: mean of the centres of a position's shapes; None without any."""
     middles = [centre.point() for centre in place.each("*/center")]
     for polygon in place.each("polygon"):
         corners = [corner.point() for corner in polygon.each("point")]

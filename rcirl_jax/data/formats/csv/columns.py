@@ -313,13 +313,7 @@ def has_holes(seconds: np.ndarray) -> bool:
 
 
 def check_clock(path: Path, seconds: np.ndarray, columns: LogColumns) -> None:
-    """Refuses times of day as digits that were read as numbers.
-
-    Args:
-      path: of the log.
-      seconds: [n] whole seconds in which there are rows, rising.
-      columns: of the log.
-    """
+    """Refuses times of day read as numbers; `seconds` [n] with rows rise."""
     if columns.clock in ("s", "ms") and has_holes(seconds):
         form = [*CLOCK_DIGITS][columns.clock == "ms"]
         raise InputError(
@@ -544,9 +538,6 @@ def meaning_of(
       automated: all that the column of this field holds.
       columns: of the file.
       spec: source TOML.
-
-    Raises:
-      InputError: headings that contradict the positions, a flag neither yes nor no.
     """
     flags = flags_of(path, automated, spec)
     names, rate = {field.name for field in columns.fields}, columns.rate_hz
@@ -568,15 +559,7 @@ def flags_of(path: Path, texts: Iterable[str], spec: Mapping) -> dict[str, bool]
     """Returns text -> whether an automation drives, or nobody knows who does.
 
     An empty cell is unknown, which counts as automated. If all other cells say yes, an
-    empty one means no.
-
-    Args:
-      path: named in errors.
-      texts: all that the column holds.
-      spec: source TOML; its `automated_values` are those that mean yes.
-
-    Raises:
-      InputError: a text that is neither yes nor no.
+    empty one means no. `automated_values` of the source TOML are those that mean yes.
     """
     own, found = {item.lower() for item in spec.get(AUTOMATED, [])}, {}
     for text in filter(None, texts):
@@ -617,9 +600,6 @@ def heading_form(
       unit: rad or deg; "": whichever fits.
       spec: source TOML.
       rate_hz: rows per second of a road user.
-
-    Raises:
-      InputError: no convention, or not the declared one, agrees with the positions.
     """
     said = one_of(spec, CONVENTION, CONVENTIONS) if spec.get(CONVENTION) else ""
     headings = None
@@ -639,14 +619,9 @@ def heading_form(
 
 
 def _turning(angles: np.ndarray, travel: np.ndarray, users: np.ndarray) -> float:
-    """Returns 1 if angles turn with the directions of travel in curves, -1 if against.
+    """Returns 1 if angles [n] rad turn with `travel` [n] rad in curves, -1 if against.
 
     The offset of a convention does not matter to it. 0: too little turns, or neither.
-
-    Args:
-      angles: [n] rad.
-      travel: [n] rad, at the same times.
-      users: [n] numbers of the road users, from 0.
     """
 
     def turned(values: np.ndarray) -> np.ndarray:

@@ -4,9 +4,7 @@ Two layouts, told apart by the column case_id: the recordings of 2019
 (recorded_trackfiles/SCENE/vehicle_tracks_NNN.csv with pedestrian_tracks_NNN.csv
 beside it) and the prediction challenge of 2021 (train/SCENE_train.csv: cases of
 4 s, each a Recording here). Maps are Lanelet2 files, maps/SCENE.osm_xy in
-metres or maps/SCENE.osm in degrees about (0, 0). Specification: README.md of
-interaction-dataset/interaction-dataset and of
-INTERPRET_challenge_multi-agent.
+metres or maps/SCENE.osm in degrees about (0, 0).
 
 Traps: pedestrians have no heading and no size (columns missing or cells
 empty), their numbers are text ("P4"), "pedestrian/bicycle" is one class, frames

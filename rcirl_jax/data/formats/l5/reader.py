@@ -3,14 +3,12 @@
 Layout: "Dataset Formats" of the L5Kit documentation; zarr version 2, format
 version 2 (traffic lights may be missing, as in version 1). Four arrays: scenes
 point at intervals of frames, frames at intervals of agents and light faces. One
-scene of some 25 s is one Recording, read by its intervals only: the full set has
-hundreds of GB.
+scene of some 25 s is one Recording, read by its intervals only.
 
 Traps: times are ns since 1970; `extent` is length, width, height; ids are unique
 inside a scene only; most agents have the class "unknown" (clutter, left out by
 default); scenes that follow each other show the same vehicles, so that they
-share a group, also over datasets: several hold scenes of one drive. Colours of
-lights are in the semantic map alone.
+share a group, also over datasets. Colours of lights are in the semantic map alone.
 """
 
 import contextlib

@@ -1,8 +1,7 @@
 """Lanelet2 maps (OSM XML) -> Lanes, shared by the importers that come with one.
 
-Specification: the Lanelet2 documentation (LaneletPrimitives,
-LaneletAndAreaTagging, RegulatoryElementTagging). Points are the attributes x, y
-(the INTERACTION dataset's .osm_xy), the tags local_x, local_y, or lat, lon.
+Specification: the Lanelet2 documentation. Points are the attributes x, y (the
+INTERACTION dataset's .osm_xy), the tags local_x, local_y, or lat, lon.
 
 Traps: the two bounds of a lanelet may be stored in either direction, bounds may
 consist of several ways, `one_way = no` lanes are driven both ways, editors
@@ -105,14 +104,11 @@ class _Lanelet:
 
 
 def read_lanelet2(path: Path, project: Projection) -> tuple[tuple[Lane, ...], list]:
-    """Reads all lanes for vehicles of a map.
+    """Reads all lanes for vehicles of a map, and notes about what was left out.
 
     Args:
       path: .osm or .osm_xy file.
       project: used where points are given by latitude and longitude.
-
-    Returns:
-      The lanes, and notes about what was left out.
 
     Raises:
       InputError: not well-formed, a point without a position, or no lane.

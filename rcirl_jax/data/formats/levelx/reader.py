@@ -2,8 +2,7 @@
 
 Each recording is three CSV files, XX_tracks, XX_tracksMeta, XX_recordingMeta;
 the header of the first tells the two layouts apart. Specification: the format
-pages of www.highd-dataset.com and levelxdata.com, and the tools
-RobertKrajewski/highD-dataset and ika-rwth-aachen/drone-dataset-tools.
+pages of www.highd-dataset.com and levelxdata.com.
 
 Traps, highD: x, y is the bounding box's upper-left corner, `width` is the
 length along x, `height` the width of the car, y points down (ours up), frames

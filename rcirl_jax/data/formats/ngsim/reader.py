@@ -143,10 +143,7 @@ def _open(path: Path, spec: dict) -> tuple[Table, RowStats]:
 
 
 def _has_stamps(table: Table) -> bool:
-    """True if Global_Time [ms] is the clock: positive, and not one for all rows.
-
-    The first few MiB of rows tell.
-    """
+    """True if Global_Time [ms] is the clock: positive, not all equal."""
     if table.has(CLOCK):
         fields, uncounted = fields_of(table, {CLOCK: "time"}), RowStats(path=table.path)
         for part in batches(table, fields, uncounted):

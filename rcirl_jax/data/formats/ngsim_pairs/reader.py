@@ -3,8 +3,7 @@
 Columns t, x_follower, v_follower, a_follower, x_leader, v_leader, a_leader,
 leader_length, spacing, dv; t in s, x of the front bumper along the road, spacing
 between the follower's front and the leader's rear. Taken from the re-extracted
-NGSIM set of T. Zhang, P. Jin et al. (arXiv 2201.04755), folder cf_ngsim_I80 of
-TeRyZh/Segment-based-Calibration-of-Car-Following-Dynamics.
+NGSIM set of T. Zhang, P. Jin et al. (arXiv 2201.04755), folder cf_ngsim_I80.
 
 Traps: files share vehicles and some hold the same pair twice (run, follower and
 leader stand in the file name ..._fF_lL_NNNNN.csv), so pairs that share a vehicle

@@ -2,11 +2,7 @@
 
 A GeoPackage is SQLite with geometry blobs (www.geopackage.org/spec, clause 2.1.3): a
 head "GP", version, flags, srs_id and an optional envelope, then well-known binary.
-
-Layers read: baseline_paths (centre lines), lanes_polygons (limits, neighbours,
-bounds), lane_connectors (paths across junctions), boundaries,
-gen_lane_connectors_scaled_width_polygons (bounds of connectors), stop_polygons,
-meta (the UTM zone). Geometries are WGS84 degrees, logs are in that UTM zone.
+Geometries are WGS84 degrees, logs are in the UTM zone that the layer `meta` names.
 
 A connector leaves its "exit lane" and enters its "entry lane". Lanes of a group
 are numbered from left to right.

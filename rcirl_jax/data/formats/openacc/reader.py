@@ -4,17 +4,15 @@ Some metadata lines (Date, Vehicle_order, Number_of_vehicles, ACC,
 Distance_setting), then columns Time [s] and per car i Speed{i} [m/s], Lat{i},
 Lon{i} [RADIANS], Alt{i}, E{i}, N{i}, U{i} [m, one local plane], IVS{i} [m,
 bumper to bumper from car i to i + 1], Driver{i} (Human or ACC). Specification:
-the notes beside each campaign (JRCDBT0001, "JRC_tests_notes.txt") and Makridis
-et al. (2021), Transportation Research Part C 125, 103047.
+the notes beside each campaign and Makridis et al. (2021), Transportation Research
+Part C 125, 103047.
 
 Traps: cells are empty where a receiver lost its fix, rows may end in surplus
 commas, cars may lack columns (numbers with holes, leaders without a Driver),
 names hold spaces, ZalaZone's Lat and Lon are degrees whatever its notes say, most
 followers are driven by their ACC and not by a human (option `drivers`), there
 is no box: the antenna is taken for its centre. Beside the drives lie tables that
-are none: specifications, lists of settings, a campaign of one car's speeds.
-
-Drives last up to hours: they are cut into Recordings of `block_s`.
+are none. Drives last up to hours: they are cut into Recordings of `block_s`.
 """
 
 import dataclasses

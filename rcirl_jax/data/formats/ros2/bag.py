@@ -238,11 +238,7 @@ def _of_sqlite(database: Database) -> BagFile:
 
 
 def as_sent(data: bytes) -> bytes:
-    """Returns a message, unpacked if rosbag2 compressed it by itself.
-
-    Raises:
-      ValueError: it is longer than MAX_MESSAGE_BYTES.
-    """
+    """Returns a message, unpacked if rosbag2 compressed it by itself."""
     size = len(data)
     if data.startswith(ZSTD_MAGIC):  # no CDR begins so
         zstandard = extra_module("zstandard", EXTRA)
@@ -287,10 +283,7 @@ def decoder_of(path: Path, name: str, topic: Topic) -> Callable[[bytes], Message
 
 @contextlib.contextmanager
 def damaged(where: str, expected: str) -> Iterator[None]:
-    """Turns whatever libraries raise on bytes that they cannot read into one line.
-
-    They have no common error: struct, zstandard, lz4, the parser and mcap have theirs.
-    """
+    """Turns what libraries raise on bytes that they cannot read into one line."""
     try:
         yield
     except InputError:

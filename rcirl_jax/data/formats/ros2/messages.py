@@ -1,12 +1,9 @@
 """Converts messages of each type to rows of numbers, by the role of the topic.
 
 A new type of message is a function in `TYPES`. Fields are found by name, as the
-definition in the file has them; covariances are not read. Numbers of classes, shapes
-and availabilities are those of the packages' .msg files: autoware_perception_msgs
-(ObjectClassification, Shape, TrackedObjectKinematics; those of
-autoware_auto_perception_msgs are the same), derived_object_msgs (Object), shape_msgs
-(SolidPrimitive). Names of classes in vision_msgs are whatever the detector calls them,
-so [kinds] of the source TOML says what they are.
+definition in the file has them. Numbers of classes, shapes and availabilities are those
+of the packages' .msg files. Names of classes in vision_msgs are whatever the detector
+calls them, so [kinds] of the source TOML says what they are.
 """
 
 import dataclasses
@@ -83,10 +80,7 @@ class Context:
     ) -> Pose:
         """Returns a place from a point and a quaternion of any length.
 
-            heading = atan2(2 (w z + x y), w^2 + x^2 - y^2 - z^2)
-
-        Raises:
-          InputError: a number that is not finite, or a heading of the ego not set.
+        The heading is atan2(2 (w z + x y), w^2 + x^2 - y^2 - z^2).
         """
         x, y, q = position.x, position.y, orientation
         for name, value in {"x": x, "y": y, "w": q.w, "z": q.z}.items():
@@ -188,14 +182,8 @@ def _obstacle(
 ) -> Row:
     """A row of an obstacle: of all in a message the header's time and frame.
 
-    Args:
-      message: with a header.
-      context: numbers its name.
-      name: the same in every message.
-      pose: of the box centre; heading NaN: by the direction of travel.
-      speed: m/s; NaN: from the positions.
-      size: m, length and width; 0: not known.
-      kind: `Kind`, UNKNOWN or LEFT_OUT.
+    Place and size [m] are the box's; NaN: a heading by the direction of travel, a speed
+    from the positions; size 0: not known; kind: `Kind`, UNKNOWN or LEFT_OUT.
     """
     in_base = float(context.check_frame(message.header.frame_id))
     number = context.names.setdefault(name, len(context.names))

@@ -1,7 +1,6 @@
 """ROS 2 bags: the ego from its localization, obstacles from perception, lights.
 
 Read: *.mcap and *.db3 of ROS 2 Iron and later; a folder with metadata.yaml is one bag.
-Messages are decoded by the definitions in the file, so no ROS installation is needed.
 Topics stand in the source TOML by role; the file says of which type they are.
 
 Traps: a pose is that of base_link, which Autoware puts at the rear axle's centre; the

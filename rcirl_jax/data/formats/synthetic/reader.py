@@ -1,8 +1,7 @@
 """Synthetic human traffic as an importer: TOML of recordings -> Recordings.
 
-See data_specs/sources/synthetic.toml for every key. Each recording has its own
-random streams, made of its entry's seed and its number in the entry; it is a
-vehicle-disjoint group of its own.
+See data_specs/sources/synthetic.toml for every key. Each recording has random streams
+of its entry's seed and its number in the entry; it is a group of its own.
 """
 
 import dataclasses

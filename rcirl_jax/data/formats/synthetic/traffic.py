@@ -217,14 +217,9 @@ def idm_acceleration(
     leader_v: np.ndarray,
     driver: np.ndarray,
 ) -> np.ndarray:
-    """IDM acceleration [m/s^2] (module docstring), without the emergency bound.
+    """IDM acceleration [n] m/s^2 (module docstring), without the emergency bound.
 
-    Args:
-      v: [...] m/s, own speed.
-      desired: [...] m/s, v0 here and now.
-      gap: [...] m, bumper to bumper; inf without a leader.
-      leader_v: [...] m/s, the leader's speed; any number without a leader.
-      driver: [...] of CAR.
+    `desired` is v0 [m/s]; `gap` [m] is bumper to bumper, inf without a leader.
     """
     a, b = driver["acceleration_mps2"], driver["deceleration_mps2"]
     desired = np.maximum(desired, 0.5)
@@ -254,11 +249,7 @@ def line_acceleration(v: np.ndarray, gap: np.ndarray, driver: np.ndarray) -> np.
 
 
 class Neighbours:
-    """Finds who is ahead and behind; a car that changes lanes is in both rows.
-
-    Args:
-      cars: [n] of CAR.
-    """
+    """Finds who is ahead and behind; a car that changes lanes is in both rows."""
 
     def __init__(self, cars: np.ndarray) -> None:
         self._s = cars["s"].copy()
@@ -270,10 +261,9 @@ class Neighbours:
         self._keys, self._car, self._rows = keys[order], car[order], rows[order]
 
     def find(self, rows: np.ndarray, ahead: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Finds the nearest car ahead of, or behind, each car in the row given for it.
+        """Nearest car [n] ahead or behind in the row given; its distance [n] m.
 
-        Returns:
-          Its index [n], and its distance [n] m from centre to centre; inf: nobody.
+        From centre to centre; inf: nobody.
         """
         side, shift = ("right", 0) if ahead else ("left", -1)
         at = np.searchsorted(self._keys, rows * ROW_M + self._s, side) + shift
@@ -339,10 +329,7 @@ class Traffic:
     ) -> np.ndarray:
         """Desired speed [n] m/s at stations s [n] m, from the limit and curve ahead.
 
-        Args:
-          cars: [n].
-          s: [n] m.
-          stretch: [n] 1 - kappa l: radius of the own path over the line's.
+        `stretch` is 1 - kappa l: radius of the own path over the line's.
         """
         at = self._grid(cars, s)
         curve = np.sqrt(cars["lateral_mps2"] / LATERAL_REFERENCE_MPS2 * stretch)

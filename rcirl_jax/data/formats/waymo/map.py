@@ -1,9 +1,8 @@
 """Map features and signal states of a Waymo scenario -> Lanes and Signals.
 
 A lane is a centre line; its width comes from the road lines and road edges that
-its boundary segments name. Signals are recorded per lane and step, with the
-point on that lane where cars have to stop. A lane that has a signal usually
-begins there: it is the path across the junction.
+its boundary segments name. Signals are recorded per lane and step; a lane that has one
+usually begins there: it is the path across the junction.
 """
 
 import dataclasses

@@ -1,11 +1,9 @@
 """Waymo Open Motion Dataset: `Scenario` messages in TFRecord files.
 
-Read without TensorFlow and without the data set's package; SCHEMA has the fields
-that are read of the public scenario.proto and map.proto
+SCHEMA has the fields that are read of the public scenario.proto and map.proto
 (https://github.com/waymo-research/waymo-open-dataset, protos). Files are named
-`*.tfrecord` or `*.tfrecord-00000-of-01000`, in the folders `scenario/training`,
-`training_20s`, `validation`, `testing`, ...; the `tf_example` files hold
-another message and are refused.
+`*.tfrecord` or `*.tfrecord-00000-of-01000`; the `tf_example` files hold another
+message and are refused.
 
 A scenario is 9.1 s at 10 Hz (`testing`: 1.1 s, `training_20s`: 20 s); states are
 box centres in metres about an arbitrary origin, headings radians
