@@ -168,7 +168,7 @@ bench: $(VENV)/.bench
 # The files that docs/results.md cites, from the datasets in out/, cheapest first; it says for how
 # many hours, and goes on where it was
 results: setup
-	$(BIN)/python -m benchmarks.remake
+	$(BIN)/python -m benchmarks.remake && $(BIN)/python -m benchmarks.tables
 
 # Everything that an accelerator is asked, in eight minutes, with the Python and JAX that are
 # there (`PYTHON=python3.12`): nothing is downloaded or built. `SMALL=--small` rehearses it on a CPU

@@ -6,7 +6,7 @@ import subprocess
 
 import pytest
 
-from benchmarks import remake
+from benchmarks import remake, tables
 from tests.docs.pages import DOCS, REPO
 
 CITED = re.findall(r"`(\w+)\.json`", (DOCS / "results.md").read_text())
@@ -33,6 +33,13 @@ def test_a_cited_file_can_be_made_again_and_says_what_made_it(name):
         [*git, "merge-base", "--is-ancestor", commit, "HEAD"], check=False
     )
     assert found.returncode == 0, f"{name}: {commit}: not in the history"
+
+
+@pytest.mark.parametrize("page", tables.PAGES)
+def test_the_tables_of_a_page_are_those_of_the_files(page):
+    text = (DOCS / page).read_text()
+    assert tables.PLACE.search(text)
+    assert tables.filled(text) == text, "python -m benchmarks.tables"
 
 
 def test_all_is_made_in_twelve_hours():
