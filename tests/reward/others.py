@@ -39,13 +39,3 @@ class Stateful(nn.Module):
     def __call__(self, x):
         x = nn.BatchNorm(use_running_average=False)(x)
         return nn.Dense(1, name="out")(x)[..., 0]
-
-
-class Needy(nn.Module):
-    """A field without a default."""
-
-    width: int
-
-    @nn.compact
-    def __call__(self, x):
-        return nn.Dense(self.width, name="out")(x)[..., 0]
