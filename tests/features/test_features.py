@@ -3,7 +3,6 @@
 import functools
 import re
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
 from rcirl_jax.features.columns import COLUMNS
 from rcirl_jax.runtime.specs import spec_root
@@ -24,7 +22,7 @@ from rcirl_jax.sampling import (
 from rcirl_jax.types import Kind
 from rcirl_jax.units import TIMES_S
 from tests.features.oracle import point
-from tests.helpers.scenes import batch, random_positions, random_scene, scene, unfused
+from tests.helpers.scenes import random_positions, random_scene, scene, unfused
 
 PRESETS = sorted(path.stem for path in (spec_root() / "features").glob("*.toml"))
 UNIT = re.compile(r"1|(1|m|s|rad)(/(m|s))?(\^\d)?")
@@ -50,15 +48,6 @@ def test_declared(preset):
         assert UNIT.fullmatch(spec.unit)
         assert spec.meaning
         assert spec.lower <= spec.none <= spec.upper
-
-
-def test_apollo_column_order_is_the_interchange_fact():
-    names = feature_map("apollo21").names
-    first = "velocity speed_limit acceleration jerk lateral_acceleration collision"
-    pairs = [f"{x}_{y}" for x in ("follow", "overtake") for y in ("distance", "speed")]
-    nudge = ["nudge_distance", "nudge_speed", "nudge_lateral"]
-    assert names[:13] == (*first.split(), *pairs, *nudge)
-    assert names[17] == "sidepass_front_distance"
 
 
 def test_every_column_is_used_by_a_preset():
@@ -93,18 +82,6 @@ def test_none_values_without_obstacles(preset):
             assert (found[:, column] == spec.none).all(), spec.name
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_vmap_equals_loop_and_jit_equals_eager(preset):
-    features = feature_map(preset)
-    drives = [drive(seed) for seed in range(4)]
-    scenes = batch([made for made, _ in drives])
-    trajectories = batch([trajectory for _, trajectory in drives])
-    vmapped = np.asarray(jax.jit(jax.vmap(features))(scenes, trajectories))
-    for row, one in zip(vmapped, drives, strict=True):
-        for found in (features(*one), jax.jit(features)(*one)):
-            np.testing.assert_allclose(row, found, rtol=1e-5, atol=1e-4)
-
-
 @pytest.mark.parametrize(
     "mode", ["speed", pytest.param("path_speed", marks=pytest.mark.slow)]
 )
@@ -131,16 +108,6 @@ def test_human_equal_to_a_candidate_has_the_same_bits(mode):
     )
     for preset, found, wanted in zip(PRESETS, all_features, human, strict=True):
         np.testing.assert_array_equal(found[picks], wanted, preset)
-
-
-def test_order_of_obstacles_does_not_matter():
-    features = feature_map("paper21")
-    made, trajectory = drive(11)
-    order = np.random.default_rng(0).permutation(made.obstacles.kind.size)
-    shuffled = made.replace(obstacles=jax.tree.map(lambda x: x[order], made.obstacles))
-    np.testing.assert_allclose(
-        features(made, trajectory), features(shuffled, trajectory), atol=1e-6
-    )
 
 
 def test_classes_by_hand():
@@ -180,16 +147,3 @@ def test_running_a_red_light_counts_once_and_only_on_red():
     assert (closest(10.0, red) < 0.0).sum() == 1
     assert (closest(10.0, ~red) < 0.0).sum() == 0
     assert (closest(1.0, red) < 0.0).sum() == 0
-
-
-def test_compiles_once_for_many_scenes():
-    features = feature_map("paper21")
-    counted = chex.assert_max_traces(features.__call__, n=1)
-    run = jax.jit(counted)
-    for seed in range(4):
-        run(*drive(seed))
-
-
-def test_unknown_preset_is_one_line():
-    with pytest.raises(InputError, match=r"preset: nope: expected one of"):
-        feature_map("nope")

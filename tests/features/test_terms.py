@@ -20,10 +20,10 @@ from rcirl_jax.export.forms import own_weights, terms_yaml, with_weights
 from rcirl_jax.export.loading import features_of, open_reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import RewardConfig, effective_params, fit_normaliser
-from rcirl_jax.sampling import SamplerConfig, sample
+from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.tuning.recipes import load_recipe, override
 from rcirl_jax.units import NUM_TIMES
-from tests.helpers.scenes import random_scene
+from tests.helpers.scenes import random_scene, sampled
 
 TRACED = """
 import jax.numpy as jnp
@@ -54,7 +54,7 @@ def test_columns_are_the_terms(tmp_path, text):
     features = feature_map(terms_file(tmp_path, text))
     scene = random_scene(0)
     scene = scene.replace(time_valid=jnp.arange(NUM_TIMES) < 12)
-    candidates = sample(jax.random.key(0), scene, SamplerConfig())
+    candidates = sampled(jax.random.key(0), scene, SamplerConfig())
     found = np.asarray(jax.jit(features.of_candidates)(scene, candidates))
     x = jax.tree.map(np.asarray, candidates.trajectory)
     limit = float(scene.path.speed_limit[0])
@@ -148,7 +148,7 @@ def test_files_in_the_planners_own_words(today):
 def test_the_search_values_as_the_weights_file_and_chooses_as_hidden_weights(today):
     features, scene = feature_map(today.preset), random_scene(0)
     kind = of_own_terms(features.own)
-    candidates = sample(jax.random.key(0), scene, SamplerConfig())
+    candidates = sampled(jax.random.key(0), scene, SamplerConfig())
     mask = jnp.arange(NUM_TIMES) < 11
     known = kind.known(scene, candidates.trajectory, mask)
     made = kind.values(known, kind.baseline(jnp.zeros(3)), True)
@@ -184,11 +184,9 @@ def test_terms_that_have_changed_are_refused(tmp_path):
     ("text", "line"),
     [
         ("TERMS = {'a': (len, 0.0)}", "a: weight 0.0: expected a number above 0"),
-        ("TERMS = {'a': (len, 'x')}", "a: weight 'x': expected a number above 0"),
         ("TERMS = [1]", "list: expected {name: [(]term, weight"),
         ("TERMS = {'a': len}", "a: <built-in"),
         ("TERM = {}", "expected a name of that file: TERM; did you mean TERM"),
-        ("import nothing_there", "ModuleNotFoundError"),
     ],
 )
 def test_what_are_no_terms_is_one_line(tmp_path, text, line):
@@ -200,7 +198,6 @@ def test_what_are_no_terms_is_one_line(tmp_path, text, line):
     ("term", "line"),
     [
         ("x.v[:3]", r"slow: shape \(3,\): expected a number or an array \[18\]"),
-        ("x.w", "slow: AttributeError"),
         ("x.v / 0.0", "slow: scene 0, candidate"),
     ],
 )
@@ -211,13 +208,6 @@ def test_a_bad_term_is_one_line(tmp_path, term, line):
     )
     with pytest.raises(InputError, match=line):
         write_own_terms(tmp_path / "today.msgpack", train)
-
-
-def test_without_terms_the_recipe_is_refused():
-    with pytest.raises(InputError, match="terms: not given"):
-        override(load_recipe("terms").train, {})
-    with pytest.raises(InputError, match="expected own terms as features"):
-        RewardConfig(hidden=(), constraint="terms")
 
 
 def test_terms_that_change_are_another_training(tmp_path):
