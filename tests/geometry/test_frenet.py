@@ -52,8 +52,9 @@ def alone(line, points):
     return jax.vmap(_from_nearest, in_axes=(None, 0, 0, 0))(line, x, y, near)
 
 
-@pytest.mark.parametrize("kind", ["straight", "circle", "clothoid", "s_curve"])
-@pytest.mark.parametrize("noise", [0.0, 0.03])
+@pytest.mark.parametrize(
+    ("kind", "noise"), [("straight", 0.0), ("clothoid", 0.03), ("s_curve", 0.03)]
+)
 def test_round_trip_within_a_centimetre(kind, noise):
     line = line_of(curve(kind, noise))
     rng = np.random.default_rng(1)
@@ -82,17 +83,7 @@ def test_many_points_are_projected_as_one_by_one_also_between_legs(legs_apart):
         np.testing.assert_array_equal(one, other)
 
 
-@given(seed=st.integers(0, 1000))
-def test_round_trip_from_cartesian(seed):
-    line = line_of(curve("s_curve"))
-    rng = np.random.default_rng(seed)
-    base = curve("s_curve")[rng.integers(5, 90)]
-    point = base + rng.uniform(-5.0, 5.0, 2)
-    back = placed(line, *project_points(line, point[None]))
-    np.testing.assert_allclose(back[0], point, atol=0.01)
-
-
-@pytest.mark.parametrize("kind", ["straight", "circle", "s_curve"])
+@pytest.mark.parametrize("kind", ["straight", "s_curve"])
 def test_shapely_projects_to_the_same_station(kind):
     points = curve(kind)
     line = line_of(points)
@@ -115,16 +106,6 @@ def test_curvature_of_a_circle_and_of_noise_on_a_straight():
     np.testing.assert_allclose(kappa, 1 / 60.0, rtol=0.03)
     noisy = np.asarray(line_of(curve("straight", 0.03)).kappa)[inside]
     assert np.abs(noisy).max() < 0.01
-
-
-def test_straight_beyond_the_end():
-    line = line_of(curve("straight"), size=512)
-    x, y, heading = _curve(line, jnp.float32(400.0))
-    kappa = lookup(line.kappa, 400.0, line.step)
-    assert float(x) - float(line.x[0]) == pytest.approx(400.0, abs=0.1)
-    assert float(y) == pytest.approx(0.0, abs=0.1)
-    assert float(kappa) == 0.0
-    assert float(heading) == pytest.approx(0.0, abs=1e-3)
 
 
 def test_duplicate_points_and_short_lines():

@@ -2,12 +2,11 @@
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rcirl_jax.features.columns import differentiate
-from rcirl_jax.sampling import trajectory_from_positions, trajectory_on_path
+from rcirl_jax.sampling import trajectory_from_positions
 from rcirl_jax.units import DT_S, TIMES_S
 from tests.helpers.scenes import random_positions, random_scene, scene
 
@@ -42,15 +41,6 @@ def test_differences_by_loop(seed, num_valid):
     assert np.isfinite(np.asarray([v, a, j])).all()
 
 
-def test_constant_acceleration_is_exact_up_to_the_mask():
-    s = 10.0 * TIMES_S + 0.5 * 1.5 * TIMES_S**2
-    valid = jnp.arange(T) < 11
-    v, a, j = differentiate(jnp.asarray(s), jnp.float32(10.0), jnp.float32(1.5), valid)
-    np.testing.assert_allclose(a[:11], 1.5, atol=1e-3)
-    np.testing.assert_allclose(v[:11], 10.0 + 1.5 * TIMES_S[:11], atol=1e-3)
-    np.testing.assert_allclose(j[:11], 0.0, atol=2e-3)
-
-
 def test_what_lies_beyond_the_mask_changes_nothing_inside():
     made = random_scene(5).replace(time_valid=jnp.arange(T) < 11)
     s, l = random_positions(5, made)
@@ -80,9 +70,3 @@ def test_lateral_derivatives_of_a_sine():
     np.testing.assert_allclose(
         drive.ddl[inner], -np.sin(np.asarray(s) / 25.0)[inner] / 625.0, atol=2e-4
     )
-
-
-def test_on_path_takes_the_given_offset():
-    made = scene(v=10.0, path_l=0.7)
-    drive = trajectory_on_path(made, 10.0 * jnp.asarray(TIMES_S))
-    assert np.asarray(drive.l) == pytest.approx(0.7)

@@ -7,7 +7,7 @@ import pytest
 from rcirl_jax.sampling.kinematics import remaining_min, running_max
 
 
-@pytest.mark.parametrize("shape", [(1,), (2,), (18,), (3, 5), (4, 128)])
+@pytest.mark.parametrize("shape", [(1,), (4, 18)])
 def test_as_numpy_accumulates(shape):
     x = np.random.default_rng(0).normal(size=shape).astype(np.float32)
     np.testing.assert_array_equal(

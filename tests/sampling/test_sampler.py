@@ -1,6 +1,5 @@
 """The sampler: fixed K, feasibility, families, determinism."""
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.errors import InputError
 from rcirl_jax.planner.rank import ONLINE_PATHS
 from rcirl_jax.sampling import (
     FAMILIES,
@@ -21,7 +19,7 @@ from rcirl_jax.sampling import (
 from rcirl_jax.sampling.sampler import speed_envelope
 from rcirl_jax.types import Kind
 from rcirl_jax.units import STATION_STEP_M, TIMES_S
-from tests.helpers.scenes import batch, random_scene, sampled, scene
+from tests.helpers.scenes import random_scene, sampled, scene
 
 CONFIGS = {mode: SamplerConfig(mode=mode) for mode in ("speed", "path_speed")}
 SAMPLE = {
@@ -157,26 +155,6 @@ def test_only_the_random_family_depends_on_the_key():
     assert differs.sum() > 40
 
 
-def test_vmap_equals_loop():
-    scenes = [random_scene(seed) for seed in range(3)]
-    keys = jax.random.split(jax.random.key(0), 3)
-    together = jax.vmap(SAMPLE["speed"])(keys, batch(scenes))
-    for i, made in enumerate(scenes):
-        alone = SAMPLE["speed"](keys[i], made)
-        np.testing.assert_allclose(
-            together.trajectory.s[i], alone.trajectory.s, rtol=1e-5, atol=1e-3
-        )
-        np.testing.assert_array_equal(together.feasible[i], alone.feasible)
-
-
-def test_compiles_once():
-    config = CONFIGS["speed"]
-    counted = chex.assert_max_traces(lambda k, made: sample(k, made, config), n=1)
-    run = jax.jit(counted)
-    for seed in range(3):
-        run(jax.random.key(seed), random_scene(seed))
-
-
 def test_hard_negatives_depart_from_the_human_with_time():
     made = scene(v=12.0)
     human = trajectory_on_path(made, 12.0 * jnp.asarray(TIMES_S))
@@ -201,11 +179,6 @@ def test_some_hard_negatives_drift_aside_where_paths_may_be_chosen():
     last = np.abs(aside[drifts, -1])
     assert ((last >= 0.24) & (last <= 1.51)).all()
     assert sorted(np.sign(aside[drifts, -1])) == [-1, -1, 1, 1]
-
-
-def test_unknown_mode_is_one_line():
-    with pytest.raises(InputError, match="mode: sideways: expected one of"):
-        SamplerConfig(mode="sideways")
 
 
 def stepped_scene(first=15.0, second=8.0, station=60.0, **changes):
