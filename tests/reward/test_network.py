@@ -67,7 +67,7 @@ def values(params, x, config, valid=None):
 
 
 @pytest.mark.parametrize(
-    ("name", "gated"), zip(CONFIGS, [False, True] * 3, strict=True)
+    ("name", "gated"), [*zip(CONFIGS, [False, True] * 3, strict=True)]
 )
 def test_a_scene_in_one_pass_is_each_trajectory_by_itself(name, gated):
     """Values and gradients of the Siamese pair, raw or by the effective module."""

@@ -46,17 +46,10 @@ def test_a_body_that_fits_keeps_its_values():
         (3, "3: expected an object"),
         ({}, "count: missing: expected a value"),
         ({"count": "3"}, "count: 3: expected a whole number"),
-        ({"count": 1, "note": 2}, "note: 2: expected a text or none"),
-        ({"count": 1, "parts": {}}, "parts: {}: expected a list"),
         ({"count": 1, "parts": [{}]}, "parts[0].shares: missing: expected a value"),
         (
             {"count": 1, "parts": [{"shares": [1], "x` - at `$[7]": 2}]},
             "unknown: expected no such field",
-        ),
-        ({"count": 1, "parts": [{"shares": []}]}, "expected a list of length >= 1"),
-        (
-            {"count": 1, "parts": [{"shares": [1, 0]}]},
-            "parts[0].shares[1]: 0: expected a number > 0.0",
         ),
         (
             {"count": 1, "parts": [{"shares": [float("nan")]}]},
@@ -75,13 +68,6 @@ def test_what_does_not_fit_is_one_line(body, line):
         checked(body, Whole, "a.json")
     assert str(caught.value).startswith("a.json: ")
     assert line in str(caught.value)
-
-
-def test_an_unknown_field_is_told_the_known_ones():
-    with pytest.raises(
-        InputError, match=r"^a: share: unknown: expected shares; did you mean shares\?$"
-    ):
-        checked({"shares": [1], "share": 2}, Part, "a")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -118,15 +104,10 @@ def test_values_get_the_types_of_their_fields():
 @pytest.mark.parametrize(
     ("found", "says"),
     [
-        ({"name": 1}, "name: 1: expected a text"),
         ({"flag": 1}, "flag: 1: expected true or false"),
         ({"count": 2**31}, "count: 2147483648: expected numbers between"),
         ({"rate": float("nan")}, "rate: nan: expected numbers between"),
-        ({"rate": "1"}, "rate: 1: expected a number"),
-        ({"pairs": 3}, "pairs: 3: expected a list"),
         ({"pairs": [[1, 2], [3]]}, "pairs: [1]: [3]: expected a list of length 2"),
-        ({"pairs": [[1, 0.5]]}, "pairs: [0][1]: 0.5: expected a whole number"),
-        ({"inner": [1]}, "inner: [1]: expected an object"),
         ({"inner": {"sizes": [[]]}}, "inner.sizes: [0]: []: expected a whole number"),
         ({"inner": {"size": []}}, "inner.size: unknown: expected some of sizes; did"),
         ({"flog": 1}, "flog: unknown: expected some of name, flag, count,"),

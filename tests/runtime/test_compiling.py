@@ -1,6 +1,5 @@
 """Seconds of compilations, of all programs or one; a bar that says why it waits."""
 
-import io
 import os
 
 import jax
@@ -8,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 from rcirl_jax.runtime import compiling
-from rcirl_jax.runtime.compiling import NOTE, CompilesFirst, compiles, use_cache
+from rcirl_jax.runtime.compiling import compiles, use_cache
 
 
 def test_compilations_are_heard_inside_the_block_only():
@@ -51,18 +50,6 @@ def test_wide_vectors_are_asked_for_where_xla_knows_them(
         assert compiling.wide_vectors() == wanted
     finally:
         compiling.wide_vectors.cache_clear()
-
-
-def test_the_note_goes_with_the_first_update():
-    said = io.StringIO()
-    with CompilesFirst(total=2, desc="drive", unit="case", file=said) as bar:
-        assert said.getvalue().rstrip().endswith(f"{NOTE}]")
-        bar.update()
-        bar.refresh()
-        assert NOTE not in said.getvalue().split("\r")[-1]
-        bar.set_postfix_str("loss=1")
-        bar.update()
-    assert "loss=1" in said.getvalue().split("\r")[-1]
 
 
 def test_the_cache_is_bounded_the_users_own_and_known_to_workers(tmp_path, monkeypatch):

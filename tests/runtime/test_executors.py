@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.executors import Processes, Serial, make_executor
+from rcirl_jax.runtime.executors import Processes, Serial
 
 
 def twice(item):
@@ -112,19 +112,3 @@ def test_a_piece_that_always_kills_its_process_is_named_and_the_others_are_done(
     assert next(results) == "healthy"
     with pytest.raises(InputError, match=r"^killer: its process was killed 3 times: "):
         next(results)
-
-
-def test_no_more_items_are_taken_than_the_workers_need():
-    taken = []
-    items = (taken.append(item) or item for item in range(100))
-    results = Processes(1).stream(twice, items)
-    next(results)
-    assert len(taken) <= 4
-    results.close()
-
-
-def test_an_executor_by_its_name():
-    with pytest.raises(InputError, match=r"executor: x: expected one of"):
-        make_executor("x")
-    assert isinstance(make_executor("local"), Serial)
-    assert make_executor("local", workers=3).workers == 3
