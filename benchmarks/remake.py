@@ -155,15 +155,6 @@ COMMANDS = (
         },
     ),
     Command(
-        "dial_verdict",
-        30,
-        "rcirl_jax gate --candidate={after}/dials/0.5.msgpack --incumbent=hand-set "
-        "--data={us101},{urban},{i80} --tuned_idm={after}/tuned_idm.json "
-        "--output={out}/verdict.json --workers=2",
-        {"dial_verdict": "verdict.json"},
-        after="chain",
-    ),
-    Command(
         "gains",
         15,
         "rcirl_jax simulate --weights={after}/dials/0.25.msgpack,"
@@ -172,6 +163,17 @@ COMMANDS = (
         "--baselines=hand-set --output={out}",
         {"gains": "suite.json"},
         after="chain",
+    ),
+    *(
+        Command(
+            f"elsewhere_{name}",
+            30,
+            f"rcirl_jax drive-elsewhere --simulator={name} {seconds}--episodes=500 "
+            "--weights={after}/weights.msgpack --output={out}",
+            {f"elsewhere_{name}": "elsewhere.json"},
+            after="chain",
+        )
+        for name, seconds in (("highway_env", "--seconds=20 "), ("sumo", ""))
     ),
     Command(
         "search",
