@@ -228,7 +228,12 @@ def make(
     out = folder / command.name
     line = command.line.format(out=out, after=folder / command.after, **places)
     print(f"python -m {line}", flush=True)
-    subprocess.run([sys.executable, "-m", *shlex.split(line)], check=True)
+    done = subprocess.run([sys.executable, "-m", *shlex.split(line)], check=False)
+    if done.returncode:
+        raise InputError(
+            f"{command.name}: its command ended with status {done.returncode}, for the "
+            "reason above; run it again to go on"
+        )
     for file, made in command.files.items():
         body = rounded(json.loads((out / made).read_text()))
         write_whole(results / f"{file}.json", json.dumps(body, indent=1) + "\n")

@@ -24,7 +24,7 @@ STEPS = flags.DEFINE_integer(
     "steps", 2000, "least steps of a training, whatever --epochs says", lower_bound=0
 )
 # step sizes that are tried
-RATES = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0)
+RATES = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 0.9)
 SEEDS = 2  # trainings of each
 
 
