@@ -155,6 +155,15 @@ COMMANDS = (
         },
     ),
     Command(
+        "dial_ranking",
+        2,
+        "rcirl_jax rank --weights={after}/dials/0.25.msgpack,{after}/dials/0.5.msgpack,"
+        "{after}/weights.msgpack,{after}/dials/2.msgpack,{after}/dials/4.msgpack "
+        "--data={us101},{urban},{i80} --output={out}/ranking.json",
+        {"dial_ranking": "ranking.json"},
+        after="chain",
+    ),
+    Command(
         "gains",
         15,
         "rcirl_jax simulate --weights={after}/dials/0.25.msgpack,"

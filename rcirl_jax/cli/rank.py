@@ -1,6 +1,6 @@
 """Rank held-out scenes with exported rewards beside all baselines.
 
-    rcirl rank --weights=FILE[,FILE...] --data=DATASET --output=ranking.json
+    rcirl rank --weights=FILE[,FILE...] --data=DATASET[,DATASET...] --output=ranking.json
 
 Several files of one loss and shape are the seeds of one row; where two of them have the
 same seed, each is a row by the name of its file. Prints the table with intervals.
@@ -13,7 +13,7 @@ from absl import flags
 from rcirl_jax.api.runs import rank
 from rcirl_jax.cli import flags as shared
 from rcirl_jax.cli.running import provenance
-from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.data.store.dataset import open_datasets
 from rcirl_jax.data.store.splits import with_tags
 from rcirl_jax.evaluation.ranking.report import format_table, to_json
 from rcirl_jax.runtime.atomic_files import write_json
@@ -22,7 +22,9 @@ USUAL = ("weights", "data", "output", "horizon", "split", "tags", "workers")
 _WEIGHTS = flags.DEFINE_list(
     "weights", None, "weights files, with commas", required=True
 )
-_DATA = flags.DEFINE_string("data", None, "dataset of `rcirl import`", required=True)
+_DATA = flags.DEFINE_list(
+    "data", None, "datasets of `rcirl import`, with commas", required=True
+)
 _OUTPUT = flags.DEFINE_string(
     "output", None, "JSON to write, beside the table that is printed"
 )
@@ -42,7 +44,7 @@ _EXECUTOR = shared.executor()
 
 def main() -> None:
     """Flags -> one report."""
-    dataset = with_tags(open_dataset(_DATA.value), _TAGS.value)
+    dataset = with_tags(open_datasets(_DATA.value), _TAGS.value)
     report = rank(
         _WEIGHTS.value,
         dataset,
