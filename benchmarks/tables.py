@@ -1,4 +1,4 @@
-"""Tables of docs/results.md and docs/simulators.md, filled in from benchmarks/results.
+"""Tables of some pages of docs, filled in from benchmarks/results.
 
     python -m benchmarks.tables      # `make results` ends with it
 
@@ -17,7 +17,7 @@ from rcirl_jax.cli.running import run
 from rcirl_jax.runtime.atomic_files import write_whole
 
 DOCS = Path(__file__).parents[1] / "docs"
-PAGES = ("results.md", "simulators.md")
+PAGES = ("results.md", "simulators.md", "labels.md")
 PLACE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 # as pages call the rows
 TITLES = {"candidate": "learned, on hand-set", "IDM, tuned": "tuned IDM"}
@@ -75,6 +75,12 @@ def mean_of(distance: Mapping) -> str:
 def sentence() -> str:
     """The verdict of the gate."""
     return f"> {read('chain_verdict')['sentence']}\n"
+
+
+def against() -> str:
+    """The best arguments against shipping."""
+    said = read("chain_verdict")["against"]
+    return "".join(f"* {one}.\n" for one in said)
 
 
 def gains() -> str:
@@ -213,13 +219,24 @@ def dial() -> str:
     """The learned part's gain turned from 0 to four times the run's."""
     ways = {"nuplan": 1, "progress": 1, "rms_acceleration": 2, "rms_jerk": 2}
     head = ("gain", "nuPlan", "progress, % of hand-set's", "RMS acceleration")
+    ranked = read("dial_ranking")["rows"]
+    top1 = {name: amount(x["top1_fde"], 2) for name, x in ranked.items()}
+
+    def row_of(dial: float) -> str:
+        """The ranking's row, which is called after its file."""
+        if not dial:
+            return "hand-set"
+        file = "weights" if dial == 1.0 else f"{dial:g}"
+        return next(name for name in top1 if name.endswith(f"({file}.msgpack)"))
+
     return markdown(
-        (*head, "RMS jerk", "distance to the human, m"),
+        (*head, "RMS jerk", "distance to the human, m", "top-1, m"),
         (
             (
-                f"{x['gain'][0]:.3g}" if x["dial"] else "0: hand-set",
+                f"{x['gain']:.3g}" if x["dial"] else "0: hand-set",
                 *(f"{x['measures'][k]['value']:.{n}f}" for k, n in ways.items()),
                 amount(x["measures"]["distance"], 2),
+                top1[row_of(x["dial"])],
             )
             for x in read("chain_dial")["settings"]
         ),
@@ -349,6 +366,7 @@ def elsewhere(simulator: str) -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "sentence": sentence,
+    "against": against,
     "gains": gains,
     "families": families,
     "suite": suite,
