@@ -1,6 +1,6 @@
 """Rank held-out scenes with exported rewards beside all baselines.
 
-    rcirl rank --weights=FILE[,FILE...] --data=DATASET[,DATASET...] --output=ranking.json
+    rcirl rank --weights=FILE[,FILE...] --data=DATASET[,DATASET...] --output=FILE
 
 Several files of one loss and shape are the seeds of one row; where two of them have the
 same seed, each is a row by the name of its file. Prints the table with intervals.

@@ -101,7 +101,7 @@ WORDS = {
     "likeness": Words(
         "nearness to the human",
         "is {less} % farther from the human",
-        "{more} % nearer to the human",
+        "{size} % nearer to the human",
     ),
 }
 HEADS = {
