@@ -5,14 +5,13 @@ import math
 
 import pytest
 
-from experiments.paper.step_sizes import RATES
 from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.simulation.suite import family_names
-from rcirl_jax.train.state import PAPER_OPTIMIZERS, TrainConfig
+from rcirl_jax.train.state import PAPER_OPTIMIZERS
 from tests.helpers.commands import succeeded
 from tests.helpers.weights_files import random_weights
 
@@ -32,11 +31,6 @@ def dataset(tmp_path_factory):
     config = ImportConfig(format="synthetic", collect=CollectConfig(stride_s=120.0))
     import_logs(read_recordings("synthetic", None), folder, config)
     return folder
-
-
-def test_every_step_size_is_one_that_a_training_takes():
-    for rate in RATES:
-        assert TrainConfig(learning_rate=rate).learning_rate == rate
 
 
 def made(name, folder, *flags):
