@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.planner.mobil import Mobil, chosen_lane, mobil_trajectory
+from rcirl_jax.planner.mobil import Mobil, chosen_lane
 from rcirl_jax.simulation.rollout import first_scenes
 from rcirl_jax.simulation.rows import mobil_row
 from tests.simulation.drives import drive, stack
@@ -63,14 +63,6 @@ def test_a_lane_that_ends_is_left():
     at = np.arange(2304) * 2.0
     right = np.where(at < 60.0, -5.75, -1.75)
     assert lane(scene_of(lanes=(0, 1), path_l=-3.5, route_right=right)) == 0
-
-
-def test_the_trajectory_goes_to_the_lane_and_follows_its_leader():
-    ahead = {"s": 60.0, "l": 3.5, "v": 12.0, "desired": 12.0}
-    way = jax.jit(mobil_trajectory)(scene_of([SLOW, ahead]), Mobil())
-    assert float(way.l[-1]) == pytest.approx(3.5, abs=0.01)
-    assert float(way.s[-1]) < 60.0 + 12.0 * 8.0 - 2.3 - 2.4665
-    assert 12.0 < float(way.v[-1]) < 15.0  # not yet at its leader's
 
 
 def test_it_passes_a_slow_car_and_stays_behind_one_where_it_cannot():

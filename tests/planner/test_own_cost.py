@@ -9,9 +9,10 @@ import pytest
 
 from benchmarks.common import untrained
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.closed_loop import checked_own_cost, gate_job
+from rcirl_jax.export.closed_loop import gate_job
 from rcirl_jax.planner import own_cost as module
-from rcirl_jax.planner.own_cost import OwnCost, check_own_cost, own_cost
+from rcirl_jax.planner.own_cost import check_own_cost, own_cost
+from rcirl_jax.planner.plan import no_plan
 from rcirl_jax.planner.rank import ONLINE, RankConfig, rank_policy
 from rcirl_jax.runtime.user_code import python_object
 from rcirl_jax.sampling import sample
@@ -72,26 +73,31 @@ def driven(row, seconds):
     return drive_row(row, cases, len(refs), config, chunk=30)
 
 
-def test_a_copy_of_the_hand_set_cost_drives_as_it_does():
+def ends(row, some):
+    """Where the plans of the first scenes end, m."""
+    scenes = jax.tree.map(lambda x: x[:10], some[0])
+    keys = jax.random.split(jax.random.key(2), 10)
+    policy = jax.jit(jax.vmap(row.policy, in_axes=(None, 0, 0, None)))
+    return np.asarray(policy(row.params, scenes, keys, no_plan()).s[:, -1])
+
+
+def test_a_copy_of_the_hand_set_cost_plans_as_it_does(some):
     config = RankConfig(own=own_cost(place("copied")))
-    ours, theirs, other = (
-        driven(baseline_row(name, "paper21", untrained(), config), 4.0)
-        for name in ("copied", "hand-set", "+velocity")
+    ours, theirs = (
+        ends(baseline_row(name, "paper21", untrained(), config), some)
+        for name in ("copied", "hand-set")
     )
-    assert all(jax.tree.leaves(jax.tree.map(np.array_equal, ours, theirs)))
-    assert not np.array_equal(ours.progress, other.progress)
+    np.testing.assert_array_equal(ours, theirs)
+    assert np.ptp(ours) > 5.0
 
 
 def test_what_is_called_back_drives_as_what_is_traced(library):
-    by_jax, by_c, times_seven = (
+    by_jax, by_c = (
         driven(Row(name="alone", policy=rank_policy(cost.score, RankConfig())), 4.0)
-        for cost in map(
-            own_cost, (place("headway_cost"), library, place("seven_and_three"))
-        )
+        for cost in map(own_cost, (place("headway_cost"), library))
     )
     np.testing.assert_allclose(by_c.progress, by_jax.progress, rtol=1e-3)
     assert np.ptp(by_jax.progress) > 5.0
-    np.testing.assert_allclose(times_seven.progress, by_jax.progress, rtol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -100,7 +106,6 @@ def test_what_is_called_back_drives_as_what_is_traced(library):
         ("constant", r"constant: in 100% of 60 scenes all candidates cost the same"),
         ("nan", r"nan: scene 0, candidate 0: nan: expected a finite cost"),
         ("one_too_few", r"one_too_few: shape \(\d+,\) for \d+ candidates: expected"),
-        ("random", r"random: scene 0, candidate 0: .*, then .*: expected the same"),
         ("dies", r"dies: its process ended with status 9: expected costs"),
         ("endless", r"endless: no answer in 1 s: expected costs"),
     ],
@@ -109,18 +114,6 @@ def test_what_is_no_cost_is_one_line(name, line, some, monkeypatch):
     monkeypatch.setattr(module, "CALL_S", 1.0)
     with pytest.raises(InputError, match=line):
         check_own_cost(own_cost(place(name)), *some)
-
-
-@pytest.mark.parametrize(
-    ("given", "line"),
-    [
-        ("nowhere.py:f", r"nowhere.py:f: No such file"),
-        (place("headway_cots"), r"headway_cots: expected a name .* headway_cost"),
-    ],
-)
-def test_what_is_not_there_is_one_line(given, line):
-    with pytest.raises(InputError, match=line):
-        own_cost(given)
 
 
 def test_a_file_may_import_its_neighbours_and_have_dataclasses(tmp_path, monkeypatch):
@@ -140,7 +133,7 @@ def test_a_file_may_import_its_neighbours_and_have_dataclasses(tmp_path, monkeyp
 
 
 def version(folder, sign):
-    """The place of a cost in two files; as +velocity drives for a sign of -1."""
+    """The place of a cost in three files; fast drives are best for a sign of -1."""
     (folder / "parts").mkdir(parents=True)
     (folder / "parts" / "weights.py").write_text(f"SPEED = {sign}\n")
     (folder / "terms.py").write_text(
@@ -156,7 +149,7 @@ def version(folder, sign):
     return f"{folder / 'cost.py'}:my_cost"
 
 
-def test_two_versions_of_an_own_cost_against_each_other(tmp_path):
+def test_two_versions_of_an_own_cost_against_each_other(tmp_path, some):
     new, old = version(tmp_path / "new", -1.0), version(tmp_path / "old", 1.0)
     job, incumbent = gate_job(
         new, old, suite="smoke", cases=None, duration_s=4.0, catalogue_seed=0,
@@ -165,12 +158,9 @@ def test_two_versions_of_an_own_cost_against_each_other(tmp_path):
     rows = {row.name: row for row in job.rows()}
     assert [*rows] == ["candidate", "my_cost", "+velocity", "IDM"]
     assert incumbent == "my_cost"
-    fastest, slowest, velocity = (
-        driven(rows[name], 4.0).progress
-        for name in ("candidate", incumbent, "+velocity")
-    )
-    np.testing.assert_array_equal(fastest, velocity)
-    assert np.all(slowest < fastest - 1.0)
+    fastest, slowest = (ends(rows[name], some) for name in ("candidate", incumbent))
+    assert np.all(slowest <= fastest)
+    assert np.mean(slowest < fastest - 1.0) > 0.5
     assert [*job.planner_facts()] == [new, old]
 
 
@@ -189,21 +179,6 @@ def test_a_library_without_the_functions(tmp_path, some):
     file = compiled(tmp_path / "none.cpp", tmp_path / "libmine.so", "-shared", "-fPIC")
     with pytest.raises(InputError, match=r'rcirl_cost_abi: missing .* extern "C": '):
         check_own_cost(own_cost(str(file)), *some)
-
-
-def test_a_library_that_is_none(tmp_path, some):
-    file = tmp_path / "libnone.so"
-    file.write_bytes(b"no library")
+    (tmp_path / "libnone.so").write_bytes(b"no library")
     with pytest.raises(InputError, match=r"libnone.so: OSError: .*expected costs"):
-        check_own_cost(own_cost(str(file)), *some)
-
-
-def test_a_name_that_a_row_has(some):
-    cost = own_cost(place("headway_cost"))
-    with pytest.raises(InputError, match="another name than the rows'"):
-        check_own_cost(cost, *some, names=["headway_cost", "IDM"])
-
-
-def test_a_good_one_passes_over_the_catalogue():
-    cost = checked_own_cost(place("headway_cost"))
-    assert cost == OwnCost(place=cost.place, sha256=cost.sha256)
+        check_own_cost(own_cost(str(tmp_path / "libnone.so")), *some)

@@ -78,24 +78,6 @@ def test_what_is_predicted_of_one(name):
         np.testing.assert_allclose(found[leaf][0], values, atol=1e-3)
 
 
-def test_who_stands_follows_a_leader_that_drives_off():
-    made = scene(v=0.0, l=-30.0)
-    s, _, _ = PREDICT(bodies({}, {"s": 8.0, "speed": 6.0}), made.ego, made.path)
-    assert float(s[0, -1]) > 5.0
-
-
-def test_a_follower_slows_down_behind_its_leader_and_keeps_its_headway():
-    made = scene(v=0.0, l=-30.0)
-    pair = bodies({"s": 0.0, "speed": 15.0}, {"s": 30.0, "speed": 10.0})
-    s, _, v = PREDICT(pair, made.ego, made.path)
-    assert float(v[0, -1]) < 11.5
-    gap = np.asarray(s[1] - s[0] - 4.6)
-    assert gap.min() > 8.0
-    # alone it would be where the leader is
-    alone, _, _ = PREDICT(bodies({"s": 0.0, "speed": 15.0}), made.ego, made.path)
-    assert float(alone[0, -1]) == pytest.approx(120.0, abs=1e-3)
-
-
 @pytest.mark.parametrize("gap", [4.0, 10.0, 40.0])
 def test_a_follower_keeps_the_headway_it_has_now(gap):
     """The IDM with T = clip((gap - 2) / v, 0.4, 1.5), integrated here in float64."""
@@ -126,7 +108,7 @@ def test_the_most_relevant_bodies_come_first():
     assert np.asarray(near.s)[:3].tolist() == order[:3]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_what_is_seen_depends_on_the_present_alone(seed):
     """Recorded futures do not leak: any other future gives the same view."""
     made = jax.tree.map(jnp.asarray, random_scene(seed))

@@ -58,10 +58,6 @@ def one_too_few(scene, candidates):
     return headway_cost(scene, candidates)[:-1]
 
 
-def random(scene, candidates):
-    return np.random.default_rng().random(len(np.asarray(candidates.feasible)))
-
-
 def endless(scene, candidates):
     while float(scene.ego.v) < 1e9:
         pass

@@ -37,10 +37,6 @@ def not_finite(scene, key):
     return steady(scene, key).at[2, 5].set(jnp.nan)
 
 
-def ahead(scene, key):
-    return steady(scene, key) + 3.0
-
-
 def alike(scene, key):
     return steady(scene, key)[:2] * 0.0 + steady(scene, key)[5]
 
