@@ -37,7 +37,7 @@ from rcirl_jax.reward import (
 from rcirl_jax.reward.hand import LatticeTerms
 from rcirl_jax.sampling import SamplerConfig, num_candidates, sample
 from tests.evaluation.driven import mean_chosen_fde, scored_baselines
-from tests.helpers.scenes import T, sampled, unfused
+from tests.helpers.scenes import T, unfused
 from tests.helpers.stored import long_rows
 
 D = len(TUNABLE)
@@ -82,7 +82,7 @@ def test_tpe_comes_near_the_minimum_of_a_shifted_sphere_within_its_box():
 
 
 @pytest.mark.parametrize("by", ["cma", "optuna"])
-@pytest.mark.parametrize("budget", [1, 11, 57])
+@pytest.mark.parametrize("budget", [1, 31])
 def test_it_takes_the_budget_and_never_more_from_the_start_on(budget, by):
     counted = Counted(sphere)
     assert search(counted, budget, by=by)[1] <= sphere(np.zeros(D))
@@ -266,14 +266,6 @@ def test_the_search_comes_close_to_a_hidden_driver_by_what_the_report_measures()
     assert hidden < 0.05
     _, best = tune(lambda x: mean_fde(DRIVER, scenes, x), both[0], 1.0, 200, 0)
     assert best < 0.5 * usual
-
-
-def test_candidates_are_those_of_the_evaluation():
-    rows = driven_by_a_hidden_driver()
-    scenes = valued_scenes(DRIVER, rows, DRIVEN, SMALL, 8.0)
-    one = jax.tree.map(lambda x: jnp.asarray(x[3]), rows.scene)
-    expected = sampled(candidates_key(jnp.asarray(3)), one, SMALL).trajectory
-    np.testing.assert_allclose(scenes.known[1].s[3], expected.s, atol=1e-3)
 
 
 def test_distances_alone_are_those_of_the_scores():

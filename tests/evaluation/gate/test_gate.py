@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import re
-import textwrap
 
 import jax
 import numpy as np
@@ -141,24 +140,19 @@ def test_nothing_ships_on_a_part_of_the_suite():
     assert verdict.reasons[0].startswith("cases of 2 s instead of 120 s")
 
 
-@pytest.mark.parametrize("families", [2, 20])
-def test_exchangeable_rewards_hardly_ever_ship(families):
+def test_exchangeable_rewards_hardly_ever_ship():
     """Two rewards of one quality, drawn anew: gains are false alarms, 5 % at most."""
     wide = dict.fromkeys(("collision_free", "min_ttc", "speed_limit", "on_road"), 0.5)
     wide |= {"progress": 0.5, "family_progress": 0.5, "family_clean": 0.5}
     drawn, shipped = 24, 0
     for seed in range(drawn):
         a, b = drives(2 * seed), drives(2 * seed + 1)
-        shipped += decide(a, b, families, **wide).decision == "ship"
+        shipped += decide(a, b, **wide).decision == "ship"
     # P(more than 4 of 24 at 5 %) = 0.6 %; the seeds are fixed
     assert shipped <= 4
 
 
 # ------------------------------------------------------------ losses and families
-
-
-def test_a_slower_reward_is_refused():
-    assert failed(decide(further(drives(), 0.97), drives())) == {"progress"}
 
 
 def test_progress_is_compared_within_the_families():
@@ -176,6 +170,7 @@ def test_progress_is_compared_within_the_families():
 def test_a_loss_in_one_family_alone_is_found_and_looked_at_first():
     """One family of twenty drives 40 % slower, all others a little faster."""
     base, some = drives(), slice(3 * EACH, 4 * EACH)
+    assert failed(decide(further(base, 0.97), base)) == {"progress"}
     verdict = decide(further(further(base, 1.03), 0.6, some), base)
     assert failed(verdict) == {"family03, progress"}
     near = broken(base, np.arange(3 * EACH, 3 * EACH + 15), ttc_bound=0)
@@ -215,10 +210,7 @@ def test_a_gain_does_not_pay_for_comfort():
 
 
 def test_the_best_arguments_against_a_candidate_that_ships():
-    """It loses 4 % in a family, a driver may be as near to people, another scores more.
-
-    Without them it is the faults that 4,000 cases without any leave possible: 0.1 %.
-    """
+    """It loses 4 % in a family, a driver may be as near to people, one scores more."""
     base, alone = drives(), dict.fromkeys(TRIVIAL_BASELINES, drives())
     mine = further(smoother(base), 0.96, slice(EACH))
     rows = alone | {"IDM": further(base, 1.5)}
@@ -230,17 +222,7 @@ def test_the_best_arguments_against_a_candidate_that_ships():
         'It loses most in "family00": 4.0 % less progress than the'
     )
     assert nearer.startswith("On held-out recordings it is not shown to be nearer to")
-    assert " than IDM: its distance minus that one's " in nearer
     assert higher.startswith("IDM has more of nuPlan's points: by ")
-    assert higher[:-1] in " ".join(format_verdict(verdict).split())
-    far = likeness(candidate=0.5)
-    (left,) = judge(
-        pair(smoother(base), base, rows=dict(alone), likeness=far), GateConfig()
-    ).against
-    assert left == (
-        "Of 4,000 cases up to 4 more with preventable at-fault collisions are not "
-        "excluded; counted were 0 more, 0 fewer"
-    )
 
 
 def part_of(whole, at):
@@ -279,25 +261,6 @@ def test_a_part_of_the_suite_says_what_it_did_show():
     assert "progress" not in apart
     assert rest == "Nothing ships on a part"
     assert then == "Next: drive what was left out"
-    same = judge(
-        part_of(pair(base, base), slice(None, None, 5)), GateConfig(), part="a part"
-    )
-    assert same.sentence.startswith("Too early to tell: on 800 cases nothing is shown")
-
-
-def test_few_families_are_said_in_words_and_intervals_stay_where_shares_can_be():
-    """Two families that disagree: over families, t with 1 degree of freedom."""
-    base = drives()
-    holds = np.array(base.holds)
-    holds[: CASES // 2, J] = True
-    holds[CASES // 2 :, J] = False
-    verdict = decide(base.replace(holds=holds), base, families=2)
-    gains = [c for c in verdict.checks if c.kind == "gain" and c.name != "likeness"]
-    for check in gains:
-        assert check.note.startswith("2 families: too few for an interval over fam")
-        assert check.outcome == "open"
-    for check in verdict.checks:
-        assert -1.0 <= check.low <= check.high <= 1.0, check.name
 
 
 # --------------------------------------------------------------------- its words
@@ -307,25 +270,13 @@ def test_few_families_are_said_in_words_and_intervals_stay_where_shares_can_be()
     ("wrong", "says"),
     [
         ({"min_ttc": 0}, "min_ttc: 0: expected within"),
-        ({"primary": ("reward",)}, "primary: reward: expected some"),
         ({"primary": ()}, "primary: none: expected some"),
-        ({"accept": ("a/1@0", "a/1@0")}, "accept: a/1@0: met twice"),
         ({"accept": tuple("abcd")}, "accept: 4 cases: expected at most 3"),
     ],
 )
 def test_bad_settings_are_one_line(wrong, says):
     with pytest.raises(InputError, match=says):
         GateConfig(**wrong)
-
-
-def test_sentences_fit_three_lines_however_much_is_wrong():
-    bad = drives(way=300.0, jerky=0.9, hard=0.9)
-    bad = broken(bad, slice(0, 3000), at_fault=1, red_lights=1, drivable=0)
-    for mine, theirs in ((bad, drives()), (drives(), bad), (drives(), drives())):
-        for known in (None, likeness()):
-            verdict = judge(pair(mine, theirs, likeness=known, rows={}), GateConfig())
-            assert len(textwrap.wrap(verdict.sentence, 100)) <= 3
-            assert "..." not in verdict.sentence
 
 
 def test_the_sentence_names_the_worst_family_and_the_json_says_the_same(tmp_path):

