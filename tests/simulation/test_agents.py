@@ -144,20 +144,6 @@ def test_a_mirrored_case_gives_the_mirrored_drive():
     np.testing.assert_allclose(shot.agents.l[0], -shot.agents.l[1], atol=0.01)
 
 
-def test_permuting_the_agents_permutes_the_drive():
-    """MOBIL's turn to decide goes by slot, so lane changes are left out here."""
-    cars = [{**car, "changes_lane": False} for car in some_traffic()]
-    order = [3, 0, 7, 5, 1, 6, 2, 4]
-    cases = [
-        make_case(cars, speed=10.0, lanes=(1, 1)),
-        make_case([cars[i] for i in order], speed=10.0, lanes=(1, 1)),
-    ]
-    record, shot = drive(cases, steps=300)
-    np.testing.assert_allclose(record.clearance[0], record.clearance[1], atol=1e-3)
-    there = shot.agents.s[1][:, : len(order)]
-    np.testing.assert_allclose(shot.agents.s[0][:, order], there, atol=1e-3)
-
-
 def test_agents_wait_for_a_free_place_and_leave_when_left_behind():
     first = {"s": 20.0, "v": 0.0, "kind": Kind.STATIC, "l": 0.0}
     late = {"s": 20.0, "v": 5.0, "relative": True, "appear_t": 1.0}

@@ -1,8 +1,5 @@
 """Expressions, family files and cases: safe, exact, the same everywhere."""
 
-import subprocess
-import sys
-
 import jax
 import numpy as np
 import pytest
@@ -128,10 +125,7 @@ high = "7"
         (('"2 * speed"', "\"__import__('os')\""), "call of __import__"),
         (('"2 * speed"', '"9 ** 9 ** 9"'), "exponent"),
         (('"2 * speed"', '"1 / 0"'), "division"),
-        (('"2 * speed"', '"2 *"'), "not arithmetic"),
         (('count = "2"', 'count = "9"'), "agents: 18"),
-        (("cases = 4", "cases = 0"), "cases"),
-        (('family = "small"', 'family = "other"'), "family"),
         (('unit = "m", ', ""), "unit"),
         (('model = "crossing"', 'model = "flying"'), "flying"),
         (('["1", "0", "2"]', '["1", "0", "0"]'), "rate"),
@@ -144,15 +138,6 @@ def test_bad_files_are_one_line_with_file_and_field(tmp_path, change, names):
         build_case(load_family(write(tmp_path, text)), 0)
     assert names in str(found.value)
     assert "\n" not in str(found.value)
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["().__class__", "'a'", "[1]", "lambda: 1", "x[0]", "open(1)", "f'{x}'", "1j"],
-)
-def test_expressions_are_arithmetic_only(text):
-    with pytest.raises(InputError):
-        Expression(text, "here")({"x": 1.0})
 
 
 def test_expressions_compute():
@@ -174,26 +159,6 @@ def test_a_case_depends_on_its_name_only():
         np.testing.assert_array_equal(a, b[1])
     other = build_case(family, 7, seed=1)
     assert not np.array_equal(alone.agents.s, other.agents.s)
-
-
-HASHED = """
-import hashlib, jax, numpy as np
-from rcirl_jax.simulation.catalogue import build_case, load_family
-total = hashlib.sha256()
-for name in ("cut_in", "compound_city"):
-    for leaf in jax.tree.leaves(build_case(load_family(name), 3)):
-        total.update(np.ascontiguousarray(leaf).tobytes())
-"""
-
-
-def test_another_process_builds_the_same_bytes():
-    here = {}
-    exec(HASHED, here)
-    done = subprocess.run(
-        [sys.executable, "-c", f"{HASHED}print(total.hexdigest())"],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    assert done.stdout.strip() == here["total"].hexdigest()
 
 
 def test_parameters_spread_over_their_ranges():

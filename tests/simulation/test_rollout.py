@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from benchmarks.common import untrained
-from rcirl_jax.errors import InputError
 from rcirl_jax.planner.baselines import CAREFUL
 from rcirl_jax.planner.rank import RankConfig, ranking
 from rcirl_jax.runtime.compiling import compiles
@@ -44,7 +43,7 @@ def is_same(first, again):
 
 def test_batch_size_and_repetition_change_no_bit():
     first = metrics_of(IDM, 2 * LANES)
-    for chunk in (2 * LANES, LANES, 7):
+    for chunk in (LANES, 7):
         assert is_same(first, metrics_of(IDM, chunk)), chunk
 
 
@@ -195,17 +194,6 @@ def test_replayed_agents_follow_the_log_or_turn_reactive():
     assert record.at_fault[0].sum() == 0
     assert record.collision[1].sum() == 0
     assert shot.agents.v[1, -1, 0] < 1.0
-
-
-@pytest.mark.parametrize("bad", [{"plan_every": 0}, {"plan_every": 7, "steps": 100}])
-def test_plan_every_has_to_divide_the_steps(bad):
-    with pytest.raises(InputError, match="plan_every"):
-        RolloutConfig(**bad)
-
-
-def test_frames_begin_with_a_span():
-    with pytest.raises(InputError, match=r"frames_every: 12: .* multiple of 5 steps"):
-        RolloutConfig(frames_every=12)
 
 
 def test_what_lasts_as_long_as_it_will_is_one_program():

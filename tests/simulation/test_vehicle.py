@@ -49,7 +49,7 @@ def test_speed_never_turns_negative_and_the_car_then_stands():
     assert float(log.a[-1]) == 0.0
 
 
-@pytest.mark.parametrize("kappa", [0.01, -0.03, 0.05])
+@pytest.mark.parametrize("kappa", [0.01, -0.05])
 def test_a_bend_is_driven_on_its_centre_line(kappa):
     log = run(ego(v=8.0), road_of(kappa=kappa), 0.0, 200)
     assert float(jnp.abs(log.l).max()) < 0.25
