@@ -1,8 +1,5 @@
 """The numpy file for planners: what it refuses, and that it needs numpy only."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -17,7 +14,6 @@ from rcirl_jax.export.own_planner.features import (
     Scene,
 )
 from rcirl_jax.features import columns as f
-from tests.conftest import REPO
 from tests.helpers.own_planner import every_column
 
 FLAT = np.zeros(128)
@@ -68,14 +64,9 @@ def test_nobody_reads_what_is_not_there():
     ("given", "line"),
     [
         ({"ego": ego(width=0.0)}, "ego.width: 0.0: expected over 0 m"),
-        ({"ego": ego(a="fast")}, "ego.a: fast: expected numbers"),
         (
             {"path": path(kappa=FLAT[1:])},
             "path.kappa: shape (127,): expected shape (128,)",
-        ),
-        (
-            {"path": path(speed_limit=FLAT - 1.0)},
-            "path.speed_limit[0]: -1.0: expected >= 0",
         ),
         (
             {"obstacles": [box(), box(s_lower=30 * T)]},
@@ -85,7 +76,6 @@ def test_nobody_reads_what_is_not_there():
             {"obstacles": [box(speed=GAP)]},
             "obstacles[0].speed[3]: nan: expected finite numbers",
         ),
-        ({"obstacles": [box(kind=9)]}, "obstacles[0].kind: 9: expected 0 to 6"),
         ({"num_valid": 19}, "num_valid: 19: expected 1 to 18"),
     ],
 )
@@ -118,13 +108,3 @@ def test_unknown_columns_and_other_units_are_refused():
         FeatureMap(["l"], ["ft"])
     with pytest.raises(FeatureError, match=r"units: 0 units: expected 1"):
         FeatureMap(["l"], [])
-
-
-def test_jax_is_not_loaded():
-    """The copied files alone: tests/onboard/test_example.py."""
-    script = (
-        f"import sys, {features.__name__}; "
-        "loaded = {m.split('.')[0] for m in sys.modules}; "
-        "assert not loaded & {'jax', 'flax', 'scipy'}, loaded"
-    )
-    subprocess.run([sys.executable, "-c", script], cwd=REPO, check=True)

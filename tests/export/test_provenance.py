@@ -13,7 +13,6 @@ from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.units import TIMES_S
 from tests.helpers import weights_files
-from tests.helpers.commands import refused
 from tests.helpers.weights_files import SPECS
 
 
@@ -27,9 +26,7 @@ def with_provenance(tmp_path, monkeypatch, **entries):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("seed", "x"), ("seed", [1]), ("seed", True), ("seed", 1.5), ("flags", "x"),
-        ("mode", 3), ("config", [1]), ("versions", "jax"), ("dataset_sha256", {}),
-        ("steps", "5"), ("git_commit", 3),
+        ("seed", True), ("flags", "x"), ("mode", 3), ("dataset_sha256", {}),
     ],
 )  # fmt: skip
 def test_entries_of_other_types_are_one_line(tmp_path, monkeypatch, name, value):
@@ -40,18 +37,7 @@ def test_entries_of_other_types_are_one_line(tmp_path, monkeypatch, name, value)
         open_reward(str(path))
 
 
-@pytest.mark.parametrize("preset", ["nope", "../../sources/csv", "/etc/hosts"])
-def test_features_that_no_package_has(tmp_path, preset):
-    made = dataclasses.replace(weights_files.example_weights(), preset=preset)
-    path = tmp_path / "w.msgpack"
-    path.write_bytes(pack(made, *weights_files.example_samples(made)))
-    with pytest.raises(
-        InputError, match=rf"w\.msgpack: preset: {preset}: expected one of apollo21, "
-    ):
-        open_reward(str(path))
-
-
-@pytest.mark.parametrize("times", [3.0 * TIMES_S, TIMES_S[:10]])
+@pytest.mark.parametrize("times", [TIMES_S[:10]])
 def test_times_that_no_trajectory_here_has(tmp_path, times):
     """The file itself is whole: only what ranks or drives here refuses it."""
     made = weights_files.example_weights(features=len(SPECS), times=len(times))
@@ -73,7 +59,7 @@ def run_on(folder, data, **flags):
     return folder
 
 
-@pytest.mark.parametrize("found", [5, [], [3], "", "a\0b", ["a", None], {"a": 1}])
+@pytest.mark.parametrize("found", [[], "a\0b", ["a", None]])
 def test_names_that_no_dataset_can_have(tmp_path, found):
     with pytest.raises(
         InputError, match=r"run\.json: flags\.data: .*expected a dataset"
@@ -86,9 +72,3 @@ def test_a_run_is_exported_with_its_own_shares_of_the_data(tmp_path):
     assert data_weights_of(run_on(tmp_path, ["a", "b"])) == "equal"
     shared = run_on(tmp_path, ["a", "b"], data_weights="scenes")
     assert data_weights_of(shared) == "scenes"
-
-
-def test_a_run_that_is_none_is_one_line(tmp_path):
-    for text in ("[1]", "nul", '{"flags": [1]}'):
-        (tmp_path / "run.json").write_text(text)
-        assert "run.json: " in refused("rcirl_jax", "export", f"--run={tmp_path}")

@@ -1,8 +1,5 @@
 """Suites and rankings in other processes: the same numbers as in this one."""
 
-import subprocess
-import sys
-
 import jax
 import numpy as np
 import pytest
@@ -13,7 +10,6 @@ from rcirl_jax.export.closed_loop import SuiteJob, drive_by, drive_piece
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.runtime.executors import Processes, Serial
 from rcirl_jax.simulation.suite import suite_refs
-from tests.conftest import REPO
 from tests.helpers.weights_files import random_weights
 from tests.train.test_step import rows
 
@@ -70,30 +66,8 @@ def assert_same_as_here(weights, there):
         np.testing.assert_array_equal(a, b)
 
 
-RAY = """
-import sys
-import ray
-from rcirl_jax.runtime.executors import Ray
-from tests.export.test_spread import assert_same_as_here
-ray.init(num_cpus=2, log_to_driver=False, logging_level="ERROR")
-assert_same_as_here(sys.argv[1], Ray("auto"))
-ray.shutdown()
-"""
-
-
 @pytest.mark.slow
 @pytest.mark.multiprocess
 def test_suites_and_rankings_do_not_depend_on_processes(weights):
     """As simulate and gate drive them, and evaluate ranks."""
     assert_same_as_here(weights, Processes(2))
-
-
-@pytest.mark.slow
-@pytest.mark.ray
-def test_suites_and_rankings_do_not_depend_on_ray(weights):
-    pytest.importorskip("ray")
-    done = subprocess.run(
-        [sys.executable, "-c", RAY, str(weights)],
-        capture_output=True, text=True, timeout=900, check=False, cwd=REPO,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-2000:]

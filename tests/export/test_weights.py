@@ -5,9 +5,7 @@ import dataclasses
 import hashlib
 import json
 import math
-import struct
 from pathlib import Path
-from types import SimpleNamespace
 
 import jsonschema
 import msgpack
@@ -32,7 +30,6 @@ from tests.helpers.weights_files import (
     ACTIVATIONS,
     example_samples,
     example_weights,
-    loop_value,
     packed,
     provenance,
     trained_network,
@@ -60,9 +57,11 @@ def test_file_scores_as_the_float64_loops(
     assert np.all(np.abs(found - values) <= 1e-5 * np.maximum(1.0, np.abs(values)))
 
 
-@pytest.mark.parametrize("scene_gating", [False, True])
-@pytest.mark.parametrize("hidden", [(), (15,), (16, 8)])
-@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize(
+    ("activation", "hidden", "scene_gating"),
+    [("tanh", (15,), False), ("tanh", (16, 8), True), ("leaky_relu", (15,), True),
+     ("relu", (16, 8), False), ("identity", (), False)],
+)  # fmt: skip
 def test_thousand_inputs_equal_the_trained_network(activation, hidden, scene_gating):
     """The file carries the EFFECTIVE weights: the trainer pins raw ones itself."""
     made = trained_network(hidden, activation, scene_gating, 1000)
@@ -137,36 +136,6 @@ def test_layout_is_the_documented_one():
     assert tuple(full["prior_cost"]) == tuple(reader.BODY["prior_cost"][0])
 
 
-@pytest.mark.parametrize("scene_gating", [False, True])
-def test_a_reader_written_from_the_page_scores_the_samples(scene_gating):
-    """docs/weights_format.md and nothing else: msgpack, struct, loops."""
-    outer = msgpack.unpackb(
-        packed(hidden=(4, 2), activation="leaky_relu", scene_gating=scene_gating)
-    )
-    body = msgpack.unpackb(outer["body"])
-
-    def numbers(box):
-        count = math.prod(box["shape"])
-        return np.reshape(struct.unpack(f"<{count}f", box["data"]), box["shape"])
-
-    found = SimpleNamespace(
-        features=body["features"],
-        times=numbers(body["times"]),
-        gamma=numbers(body["gamma"]),
-        **{key: numbers(box) for key, box in body["normaliser"].items()},
-        kernels=[numbers(layer["kernel"]) for layer in body["layers"]],
-        biases=[numbers(layer["bias"]) for layer in body["layers"]],
-        activation=body["activation"],
-        leaky_slope=body["leaky_slope"],
-        scene_gating=numbers(body["scene_gating"]) if scene_gating else None,
-    )
-    features, valid, values = (
-        numbers(body["samples"][key]) for key in ("features", "valid", "value")
-    )
-    scored = [loop_value(found, *one) for one in zip(features, valid, strict=True)]
-    np.testing.assert_allclose(scored, values, rtol=1e-5, atol=1e-5)
-
-
 def test_schema_describes_the_body_and_refuses_others():
     path = spec_root() / "reward_weights.schema.json"
     schema = json.loads(path.read_text(encoding="utf-8"))
@@ -239,23 +208,17 @@ ENDLESS["self"] = ENDLESS
     [
         # what the reader says of the file that would be written
         ({"scale": np.array([1.0, 0.0, 1.0])}, "normaliser.scale[1]: 0: expected over"),
-        ({"gamma": np.array([1.0, 1.0, 1e39, 1.0])}, "gamma[2]: inf: expected finite"),
-        ({"preset": 3}, "preset: 3: expected a text"),
-        (prior(0.0), "prior_cost.gain: 0: expected above 0"),
         (prior(math.inf), "prior_cost.gain: inf: expected a finite number"),
         # what never becomes a file
         ({"preset": object()}, "can not serialize"),
         ({"gamma": "many"}, "gamma: could not convert string to float"),
-        ({"gamma": [[1.0], [1.0, 2.0]]}, "gamma: setting an array element"),
         ({"biases": ()}, "biases: 0 biases: expected one for each kernel"),
         ({"provenance": {}}, "provenance.dataset_sha256: missing: expected a value"),
         *(
             ({"provenance": {**provenance(), **entry}}, message)
             for entry, message in (
                 ({"metrics": {"fde": math.nan}}, "provenance: nan: expected texts"),
-                ({"seed": 2**70}, "Integer value out of range"),
                 ({"flags": {1: 2}}, "int is not allowed for map key"),
-                ({"flags": {"a": b"x"}}, "provenance: bytes of 1: expected texts"),
                 ({"flags": ENDLESS}, "maximum recursion depth exceeded"),
             )
         ),
@@ -270,16 +233,6 @@ def test_what_a_reader_would_refuse_is_never_written(changes, message, tmp_path)
     assert str(caught.value).startswith(f"{path}: ")
     assert message in str(caught.value)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_samples_have_to_fit():
-    weights = example_weights(with_prior=True)
-    features, valid, values = example_samples(weights)
-    for wrong in (features[:, :, :2], features[:0], features[:, :0], features[0]):
-        with pytest.raises(InputError, match=r"samples\.features\.shape: .*: expected"):
-            pack(weights, wrong, valid, values)
-    with pytest.raises(InputError, match=r"samples\.features\[0, 0, 0\]: nan"):
-        pack(weights, features * np.nan, valid, values)
 
 
 def test_a_dial_multiplies_the_gain_and_nothing_else(tmp_path):
