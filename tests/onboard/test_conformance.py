@@ -17,7 +17,7 @@ from rcirl_jax.export.own_planner import features
 from rcirl_jax.export.own_planner.builder import plain_scene
 from rcirl_jax.export.own_planner.choose import admit
 from rcirl_jax.features import columns as f
-from rcirl_jax.planner.safety import Reason, SafetyConfig
+from rcirl_jax.planner.safety import SafetyConfig
 from rcirl_jax.units import NUM_TIMES
 from tests.helpers.own_planner import TOLERANCE, entries, error, numpy_answers
 from tests.onboard.programs import ONBOARD
@@ -81,11 +81,6 @@ def test_the_rulings_are_those_of_the_numpy_file(cases):
         np.testing.assert_allclose(found, cases[name].rulings, rtol=1e-6, err_msg=name)
 
 
-def test_every_rule_is_broken_in_some_case(cases):
-    found = {int(x) for case in cases.values() for x in case.rulings[::3]}
-    assert found == set(Reason) - {Reason.NOT_FEASIBLE}
-
-
 def test_the_filter_is_compared_if_asked_for(cases, tmp_path):
     said = answers(cases, tmp_path, lambda name, numbers: numbers)
     assert checked(*said)[0] == 0
@@ -99,17 +94,6 @@ def test_the_filter_is_compared_if_asked_for(cases, tmp_path):
     status, _, lines = checked("--filter", *answers(cases, tmp_path, whole))
     assert status == 1
     assert lines == ["follow: rulings: candidate 0, reason: 3: expected 2"]
-
-
-def test_every_column_takes_several_values(cases):
-    found = {}
-    for case in cases.values():
-        for name, column in zip(case.columns, np.array(case.rows).T, strict=True):
-            found.setdefault(name, set()).update(np.round(column, 3).tolist())
-    assert len(found) == 28
-    for name, values in found.items():
-        least = 2 if name in ("collision", "nudge_distance") else 5
-        assert len(values) >= least, name
 
 
 def answers(cases, folder, change):
@@ -129,38 +113,15 @@ def checked(*command):
     return done.returncode, done.stdout.strip(), done.stderr.strip().splitlines()
 
 
-def test_features_alone_can_be_checked(cases, tmp_path):
-    def without_scores(name, numbers):
-        return numbers[: -len(cases[name].scores)]
-
-    command = answers(cases, tmp_path, without_scores)
-    assert checked("--features-only", *command)[0] == 0
-    status, _, lines = checked(*command)
-    assert status == 1
-    assert lines[0].startswith("free_road: 1134 numbers: expected 1137")
-
-
 # a file of F for planners, what stands there, the mistake instead, and the columns of
 # the case "follow" that are wrong then
 FAULTS = {
     "none": (features, "", "", ()),
-    "one_row_late": (
-        features,
-        '_numbers(f"{field}.{name}", given, (NUM_TIMES,))',
-        'np.roll(_numbers(f"{field}.{name}", given, (NUM_TIMES,)), 1)',
-        ("collision_distance", "follow_distance"),
-    ),
     "sign_of_relative_speed": (
         f,
         "xp.where(unknown, 0.0, speed - v)",
         "xp.where(unknown, 0.0, v - speed)",
         ("follow_speed",),
-    ),
-    "kilometres_an_hour": (
-        f,
-        '"velocity": lambda frame: frame.point.v',
-        '"velocity": lambda frame: 3.6 * frame.point.v',
-        ("velocity",),
     ),
 }
 
@@ -197,15 +158,6 @@ def test_planted_faults_are_found(cases, tmp_path, monkeypatch, fault):
     assert status == int(fault != "none")
     named = [line.split(": ") for line in lines if line.startswith("follow: features")]
     assert {place.split(", ")[-1] for _, _, place, *_ in named} == set(columns)
-
-
-def test_times_that_do_not_count_may_be_anything(cases, tmp_path):
-    def change(name, numbers):
-        case = cases[name]
-        counts = [c for *_, c in case.expected()]
-        return [x if c else 7e7 for x, c in zip(numbers, counts, strict=True)]
-
-    assert checked(*answers(cases, tmp_path, change))[0] == 0
 
 
 def test_programs_that_fail_are_named():

@@ -99,21 +99,10 @@ def test_both_programs_print_what_the_package_says(stranger, twin, weights):
     assert error(found, wanted) <= TOLERANCE
 
 
-def test_the_choice_needs_no_file_of_the_guard(stranger):
-    command = "import choose, reader, sys; assert 'guard' not in sys.modules"
-    in_python(stranger, "-c", command)
-
-
 def test_the_stranger_has_numpy_and_msgpack_only(stranger):
     for name in ("jax", "scipy", "rcirl_jax"):
         with pytest.raises(AssertionError, match=f"No module named '{name}'"):
             in_python(stranger, "-c", f"import {name}")
-
-
-def test_the_twin_names_what_is_wrong(twin):
-    done = subprocess.run([twin, "none"], capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith("none: ")
 
 
 def test_choose_adds_a_reward_with_a_prior_cost_to_the_costs(tmp_path):

@@ -6,10 +6,8 @@ allocation over 256 MB too. Needs cmake, a C++17 compiler and msgpack-c's C head
 
 import dataclasses
 import os
-import re
 import shutil
 import struct
-import subprocess
 
 import msgpack
 import numpy as np
@@ -74,14 +72,9 @@ def assert_close(found, expected):
     ("hidden", "activation", "scene_gating"),
     [
         ((), "identity", False),
-        ((), "identity", True),
-        ((15,), "tanh", False),
-        ((15,), "tanh", True),
         ((15,), "leaky_relu", False),
-        ((64,), "tanh", False),
         ((64,), "relu", True),
         ((32, 16), "tanh", True),
-        ((32, 16), "relu", False),
     ],
 )
 def test_ten_thousand_scores_equal_python_and_jax(
@@ -157,39 +150,7 @@ def test_a_thousand_plans_get_the_guard_of_python(programs, tmp_path, data):
             assert float(row[2]) == verdict.share
 
 
-def test_choose_takes_the_best_candidate_that_has_a_value(programs, tmp_path):
-    path, missing = tmp_path / "weights.msgpack", tmp_path / "missing"
-    path.write_bytes(VALID)
-    reward = load_weights(path)
-    features = np.random.default_rng(0).normal(size=(50, 3, 2)).astype(np.float32)
-    order = np.argsort(reward.value(features))
-    features[order[-1], 1, 0] = np.nan
-    may = np.ones(50, np.uint8)
-    may[order[-2]] = 0  # so its filter says
-    (tmp_path / "may").write_bytes(may.tobytes())
-    (tmp_path / "one").write_bytes(b"\1")
-    given = {"input": features.tobytes()}
-    line = run(programs / "choose", path, tmp_path / "may", **given).decode()
-    found = re.fullmatch(r"candidate (\d+) of 50, value (\S+), 1 refused\n", line)
-    assert found is not None
-    assert int(found[1]) == order[-3]
-    third = reward.value(features[order[-3]])
-    assert float(found[2]) == pytest.approx(float(third), abs=1e-5)
-    with pytest.raises(WeightsError) as python:
-        load_weights(missing)
-    for file, data, message, code in (
-        (path, features[:1].tobytes()[4:], "stdin: candidates: 5 numbers: expected", 2),
-        (path, np.full(6, np.nan, "f4").tobytes(), "stdin: candidates: none of 1 ", 1),
-        (missing, b"", f"{python.value}\n", 2),
-    ):
-        command = [programs / "choose", file, tmp_path / "one"]
-        done = subprocess.run(command, input=data, capture_output=True, check=False)
-        assert (done.returncode, done.stdout) == (code, b"")
-        assert done.stderr.decode().startswith(message)
-
-
-@pytest.mark.parametrize("mode", [None, "speed", "path_speed"])
-@pytest.mark.parametrize("with_prior", [False, True])
+@pytest.mark.parametrize(("mode", "with_prior"), [(None, True), ("path_speed", False)])
 def test_a_reward_says_what_it_is_for_as_in_python(
     programs, tmp_path, mode, with_prior
 ):

@@ -88,18 +88,6 @@ def test_rulings_on_random_scenes_are_those_of_jax(reader, tmp_path, on_path):
         np.testing.assert_allclose(rulings[sure], wanted[sure], rtol=1e-6)
 
 
-def test_offsets_need_the_edges_of_the_road():
-    scenes = drawn_scenes.scenes(np.random.default_rng(5), 1)
-    s, l = drawn_scenes.candidates(np.random.default_rng(6), scenes, 2)
-    plain = plain_scene(jax.tree.map(lambda x: x[0], scenes))
-    object.__setattr__(plain.path, "road_left", None)
-    assert len(admit(plain, s[0]).reason) == 2
-    with pytest.raises(
-        FeatureError, match="road_right: None: expected edges, for cand"
-    ):
-        admit(plain, s[0], l[0])
-
-
 def test_what_the_vehicle_cannot_drive_is_the_first_reason():
     scenes = drawn_scenes.scenes(np.random.default_rng(5), 1)
     s, _ = drawn_scenes.candidates(np.random.default_rng(6), scenes, 2)

@@ -32,7 +32,7 @@ def in_cpp(program, given):
     return done.stderr.decode().rstrip("\n")
 
 
-@pytest.mark.parametrize("first", range(0, 200, 50))
+@pytest.mark.parametrize("first", [0, 50])
 def test_random_surroundings_give_the_scene_of_python(program, first):
     for seed in range(first, first + 50):
         given = drawn(seed)
