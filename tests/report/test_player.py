@@ -8,16 +8,13 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.report.replays import AHEAD_M, BEHIND_M, FRAME_STEPS, make_replays
 from rcirl_jax.simulation import rollout
 from rcirl_jax.simulation.cases import STEP_S
-from rcirl_jax.simulation.recorded import held_out
 from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.suite import (
     drive_row,
     drive_with_logs,
-    recorded_set,
     rollout_config,
 )
 from tests.report.tuning_case import PLAYED, SECONDS, cheap_rows, small_cases
-from tests.simulation.stored import Rows, stored
 
 
 def driven(row, cases, count):
@@ -102,16 +99,3 @@ def test_a_case_that_the_suite_does_not_have():
     with pytest.raises(InputError, match="cut_in/007@0: expected a case"):
         make_replays(cheap_rows(), small_cases(), ["cut_in/007@0"], 1)
     assert make_replays(cheap_rows(), small_cases(), [], 1) == []
-
-
-@pytest.mark.slow
-def test_the_recorded_human_drives_beside_the_others():
-    cases = recorded_set(held_out([Rows(stored(1))], 1))
-    (one,) = make_replays(cheap_rows(), cases, cases.ids, 1)
-    assert [drive.row for drive in one.drives] == [
-        "candidate", "hand-set", "recorded human",
-    ]  # fmt: skip
-    human, log = one.drives[-1], np.asarray(cases.build(0, 1).replay.ego_s[0])
-    at = FRAME_STEPS * (np.arange(len(human.s)) + 1)
-    assert human.s == pytest.approx(log[np.minimum(at, len(log) - 1)], abs=0.06)
-    assert not any(human.plan)

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rcirl_jax.errors import InputError
 from rcirl_jax.export import save
 from rcirl_jax.simulators.nuplan import reward_planner
 from rcirl_jax.units import TIMES_S
@@ -128,10 +127,3 @@ def test_it_stops_behind_who_stands_and_before_a_red_light(planner):
 def test_a_green_light_stops_nobody(planner):
     lights = [light(20, "GREEN"), light(31, "UNKNOWN")]
     assert planned(planner, ego(x=60.0), lights=lights)[-1, 1] > 130.0
-
-
-def test_a_route_without_lanes_is_refused(planner):
-    with pytest.raises(InputError, match="route_roadblock_ids: no lanes"):
-        planner.initialize(
-            SimpleNamespace(route_roadblock_ids=["gone"], map_api=road())
-        )

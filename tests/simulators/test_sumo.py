@@ -120,17 +120,6 @@ def test_yellow_stays_red_for_who_could_stop_when_it_began():
     running.close()
 
 
-def test_who_keeps_its_speed_runs_red_lights_and_who_brakes_hits_nobody():
-    running = Sumo().start(NAMES, None)
-    passed = 0
-    for _ in range(400):
-        views = running.look()
-        passed += sum(view.passed_red for view in views if view)
-        running.step([view and move(view) for view in views])
-    running.close()
-    assert passed > 0
-
-
 def test_the_own_driver_stops_at_red_and_the_same_names_are_the_same_drives():
     ways = []
     for _ in range(2):
