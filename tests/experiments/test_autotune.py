@@ -1,4 +1,4 @@
-"""The loop by its command: once, again; `slow`: changed, damaged."""
+"""The loop by its command: once, and again."""
 
 import html
 import json
@@ -22,8 +22,8 @@ positive = "nearest"
 [simulated_demonstrations]
 expert = "own cost"
 cases = 1
-duration_s = 45.0
-stride_s = 8.0
+duration_s = 20.0
+stride_s = 4.0
 [prior_cost]
 gain = 1.1
 """
@@ -113,37 +113,10 @@ def test_a_small_loop(tmp_path):
     assert "flags" in dataset.facts()["made_by"]
 
 
-@pytest.mark.slow
-@pytest.mark.multiprocess
-def test_a_damaged_report_is_drawn_again_and_other_weights_leave_no_verdict(tmp_path):
-    run = tmp_path / "run"
-    flags = (f"--output={run}", *SMALL)
-    succeeded("rcirl_jax", "autotune", *flags)
-    page = (run / "report.html").read_bytes()
-    (run / "report.html").write_text("damaged")
-    mended = fresh("rcirl_jax", "autotune", *flags)
-    assert [name for name, was in kept(mended).items() if not was] == ["report"]
-    assert (run / "report.html").read_bytes() == page
-    assert (run / "verdict.json").exists()
-    changed = ("--learning_rate=2e-3", "--until=train")
-    told = kept(succeeded("rcirl_jax", "autotune", *flags, *changed))
-    told = {name: was for name, was in told.items() if name[:8] != "demonstrate"}
-    assert told == {"import 0": True, "train 0": False, "export": False}
-    assert not (run / "verdict.json").exists()
-    assert not (run / "report.html").exists()
-
-
 @pytest.mark.multiprocess
 def test_a_page_of_no_run_is_one_line(tmp_path):
     line = refused("rcirl_jax", "report", f"--run={tmp_path}")
     assert line.endswith("stages.json: gate: missing: expected a run with its verdict")
-    made_by = {"flags": {"seeds": []}}
-    gate = {"key": "k", "inputs": {}, "outputs": {}, "made_by": made_by}
-    stages = {"schema_version": 1, "stages": {"gate": gate}}
-    (tmp_path / "stages.json").write_text(json.dumps(stages))
-    for flag, message in (("--seeds=2", "--seeds: expected none"), ("", "--seeds: ")):
-        flags = (f"--run={tmp_path}", *flag.split())
-        assert message in refused("rcirl_jax", "report", *flags)
 
 
 @pytest.mark.multiprocess

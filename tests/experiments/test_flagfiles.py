@@ -8,7 +8,7 @@ from rcirl_jax.data.importing import import_logs
 from rcirl_jax.export.reader import load_weights
 from tests.conftest import REPO
 from tests.data.small_logs import CONFIG, write_logs
-from tests.helpers.commands import command
+from tests.helpers.commands import command, refused
 from tests.helpers.weights_files import random_weights
 
 FOLDER = REPO / "experiments" / "flagfiles"
@@ -20,11 +20,6 @@ RUNS = {
         ("--input={root}/logs", "--output={out}/data", "--stride=2",
          "--norequire_speed_change"),
         "data/manifest.json",
-    ),
-    "paper_train": (
-        "train",
-        ("--data={root}/data", "--workdir={out}", "--epochs=1", "--batch_size=8"),
-        "weights.msgpack",
     ),
     "listwise_train": (
         "train",
@@ -41,11 +36,6 @@ RUNS = {
         "evaluate",
         ("--weights={root}/w.msgpack", "--data={root}/data", "--output={out}/r.json"),
         "r.json",
-    ),
-    "full_suite": (
-        "simulate",
-        ("--weights={root}/w.msgpack", "--output={out}", "--baselines=", *SHORT[:3]),
-        "suite.json",
     ),
     "gate_full": (
         "gate",
@@ -84,8 +74,24 @@ def root(tmp_path_factory):
     return folder
 
 
+# their experiments run by other flag files, or by their commands in other tests
+READ = {
+    "paper_train": ("train", "--data=nowhere", "--workdir={out}"),
+    "full_suite": ("simulate", "--weights=nowhere", "--output={out}"),
+}
+
+
 def test_every_flag_file_has_its_run():
-    assert {file.stem for file in FOLDER.iterdir()} == set(RUNS)
+    assert {file.stem for file in FOLDER.iterdir()} == {*RUNS, *READ}
+
+
+@pytest.mark.multiprocess
+@pytest.mark.parametrize("name", READ)
+def test_a_flag_file_is_taken(name, tmp_path):
+    module, *given = READ[name]
+    given = [f"--flagfile={FOLDER / name}.flags", *given]
+    line = refused(f"experiments.{module}", *(x.format(out=tmp_path) for x in given))
+    assert "nowhere" in line  # which is asked for after the flags
 
 
 @pytest.mark.multiprocess

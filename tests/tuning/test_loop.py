@@ -2,20 +2,10 @@
 
 import types
 
-import pytest
-
 from rcirl_jax.tuning import loop
 
 NAMES = ("import", "demonstrate", "train", "rank")
 WORK = {"demonstrate": 60.0, "train": 120.0, "rank": 60.0}
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [(59.4, "59 s"), (59.6, "1 min"), (3599.0, "1 h 00 min")],
-)
-def test_durations_in_words(seconds, words):
-    assert loop.in_words(seconds) == words
 
 
 class Time:
@@ -73,33 +63,3 @@ def test_stages_of_an_earlier_run_take_no_time_until_something_changes(monkeypat
     run.done.append("demonstrate learner 1")
     clock.begin("train", WORK)
     assert " about 3 min left" in run.said[-1]
-
-
-def test_a_report_that_cannot_be_drawn_is_one_line(monkeypatch):
-    def without(name):
-        def report(*_):
-            raise ModuleNotFoundError(name, name=name)
-
-        monkeypatch.setattr(loop, "report", report)
-        return loop._drawn(types.SimpleNamespace(page="p"), None, None, ())
-
-    assert without("jinja2.sandbox") == (
-        "no report: jinja2: not installed: expected pip install 'rcirl-jax[report]'"
-    )
-    with pytest.raises(ModuleNotFoundError):
-        without("rcirl_jax.report.none")
-
-
-def test_what_to_do_next_without_a_report_is_to_have_one(tmp_path):
-    run = types.SimpleNamespace(weights="w", tables="t", folder=tmp_path)
-    verdict = types.SimpleNamespace(
-        decision="ship", sentence="Ship.", look_at=("a@0",), part=""
-    )
-
-    def last(page):
-        said = loop._ending(run, verdict, page, "b@0", {"training": ["too short"]})
-        assert "\nwarnings: 1, said above and in the report: training\n" in said
-        return said.splitlines()[-1]
-
-    assert "rcirl replay --weights=w --case=a@0" in last("report to open: r")
-    assert f"rcirl report --run={tmp_path}" in last(loop.NO_REPORT + "x")
