@@ -9,14 +9,7 @@ import re
 import pytest
 
 from tests.conftest import REPO
-from tests.helpers.commands import command as forked
 from tests.helpers.commands import fresh as command
-
-PROGRAMS = sorted(
-    ".".join(file.relative_to(REPO).with_suffix("").parts)
-    for file in (REPO / "benchmarks").rglob("*.py")
-    if "run(main)" in file.read_text()
-)
 
 RESULTS = sorted((REPO / "benchmarks" / "results").rglob("*.json"))
 SMALL = {
@@ -42,9 +35,3 @@ def test_benchmark_writes_its_result(name, tmp_path):
 @pytest.mark.parametrize("file", RESULTS, ids=lambda file: file.stem)
 def test_no_result_names_a_path_of_its_machine(file):
     assert not re.findall(r'"/[^"/ ]+/[^"]*"', file.read_text())
-
-
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_every_program_finds_what_it_imports(name):
-    done = forked(name, "--help")
-    assert name.rpartition(".")[2] in done.stdout, done.stderr

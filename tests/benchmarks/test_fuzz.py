@@ -1,6 +1,5 @@
 """Damaged and hostile files for every reader, a few; more with the marker `long`."""
 
-import itertools
 import json
 import random
 import resource
@@ -14,10 +13,8 @@ import pytest
 from benchmarks.reliability.fuzz import changes
 from benchmarks.reliability.fuzz.contract import breach, watched
 from benchmarks.reliability.fuzz.readers import READERS, inputs
-from rcirl_jax.errors import InputError, as_input_error
-from rcirl_jax.export.sweep import SWEEP, read_sweep
+from rcirl_jax.errors import as_input_error
 from rcirl_jax.features import mapping
-from rcirl_jax.report.charts import sweep_picture
 from rcirl_jax.runtime import pipeline
 
 LOGS, OTHERS = 16, 60  # inputs of a whole log, and of other readers
@@ -75,21 +72,6 @@ def test_a_reader_keeps_its_word_for_long(
         print(f" {count:,} inputs by the seed {seed!r}", end="")
 
 
-def test_a_sweep_that_is_read_can_be_drawn(folder):
-    target, drawings = READERS["run"](folder), 0
-    for file in inputs(target, "3", 4000):
-        if file.name == SWEEP:
-            try:
-                report = read_sweep(folder)
-            except InputError:
-                continue
-            sweep_picture(folder / "sweep.png", report)
-            drawings += 1
-        if drawings == 8:
-            break
-    assert drawings == 8
-
-
 def test_a_planted_defect_refused_memory_and_places_outside_are_seen(
     folder, monkeypatch
 ):
@@ -115,10 +97,3 @@ def test_a_planted_defect_refused_memory_and_places_outside_are_seen(
         (folder / "secret").write_text("y")
         (folder / "secret").unlink()
     assert [x.split(" ")[0] for x in seen] == ["open", "os.remove"]
-
-
-def test_the_same_seed_draws_the_same_inputs(folder):
-    target = READERS["suite"](folder)
-    drawn = [[x.read_bytes() for x in inputs(target, "a", 20)] for _ in range(2)]
-    assert drawn[0] == drawn[1]
-    assert len(set(itertools.chain(*drawn))) > 15

@@ -6,15 +6,12 @@ from pathlib import Path
 import pytest
 
 from benchmarks.judged import (
-    TRUTH,
     Judged,
-    Verdicts,
     compare,
     compare_in,
     read_verdicts,
     scores,
 )
-from rcirl_jax.errors import InputError
 from tests.helpers.roads import WIDTH, car, recording, smooth_step
 
 DATA = Path(os.environ.get("RCIRL_DATA", Path(__file__).parents[3] / "shared/data"))
@@ -57,19 +54,6 @@ def test_labels_beside_verdicts():
     assert table["two"]["ignore"] == (1, 1, 0)
     assert table["two"]["overtake"] == (0, 0, 1)
     assert table["all"]["ignore"] == (2, 1, 0)
-
-
-def test_the_verdicts_of_the_repository(tmp_path):
-    verdicts = read_verdicts()
-    assert {one.verdict for one in verdicts.scenes} == set(TRUTH)
-    first, held_out = (
-        {(x.recording, x.track, x.obstacle) for x in verdicts.scenes if x.batch == name}
-        for name in ("first", "held_out")
-    )
-    assert not first & held_out  # other events
-    with pytest.raises(InputError):  # there are no recordings
-        compare(verdicts, tmp_path)
-    assert compare(Verdicts(sites={}, scenes=[]), tmp_path) == []
 
 
 @pytest.mark.slow

@@ -5,8 +5,7 @@ import sys
 
 import pytest
 
-from benchmarks.reliability import table
-from benchmarks.reliability.table import Row, rows_of, words
+from benchmarks.reliability.table import rows_of, words
 from tests.docs.pages import DOCS, REPO
 
 ROWS = rows_of((DOCS / "reliability.md").read_text())
@@ -31,15 +30,3 @@ def test_what_a_row_runs_is_there(row):
     chosen = command[command.index("-k") + 1] if "-k" in command else ""
     for word in KEYWORD.findall(chosen):
         assert word in names or f'"{word}"' in text, word
-
-
-@pytest.mark.multiprocess
-def test_a_row_whose_tests_are_skipped_has_not_run(tmp_path):
-    test = tmp_path / "test_it.py"
-    test.write_text(
-        "import pytest\ndef test_good(): pass\ndef test_not(): pytest.skip()\n"
-    )
-    for chosen, status in (("test_good", 0), ("test_not", table.NOT_RUN)):
-        command = f"pytest {test} -p no:cacheprovider -k {chosen}"
-        row = Row(fault="a", minutes=1, command=command)
-        assert table.ran(row, str(tmp_path))["status"] == status
