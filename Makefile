@@ -23,11 +23,11 @@ install = $(if $(LOCK),\
 
 # Minutes; they touch every dependency: logs, store, two epochs, resume, export, readers, pages
 QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_writes_what_it_should \
-  export_and_rank exported_values_are_the_trainers) \
+  exported_values_are_the_trainers) \
   tests/data/formats/test_conformance.py tests/data/store/test_dataset.py \
   tests/data/test_import_elsewhere.py::test_no_cluster_is_one_line \
   tests/evaluation/test_baselines.py::test_cma_es_finds_the_minimum_of_a_shifted_sphere \
-  tests/export/test_forms.py tests/export/test_reader.py tests/export/test_weights.py \
+  tests/export/test_forms.py tests/export/test_weights.py \
   tests/features/test_features.py::test_equals_the_oracle tests/report/test_data_page.py
 QUICKLY = -m pytest -q -m "not slow and not dataset" $(QUICK)
 # with other versions: compiled quickly, and no files of damaged bytes

@@ -6,18 +6,15 @@ import re
 import signal
 import subprocess
 import sys
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
 
 from rcirl_jax import __version__
-from rcirl_jax.cli import running
 from rcirl_jax.cli.flags import left_out
 from rcirl_jax.cli.rcirl import COMMANDS, overview
 from rcirl_jax.errors import InputError
 from rcirl_jax.tuning.recipes import DEFAULT, load_recipe
-from tests.conftest import REPO
 from tests.helpers.commands import command, refused, succeeded
 
 LINES, COLUMNS = 40, 100  # of a screen
@@ -93,17 +90,6 @@ def test_the_overview_fits_and_names_every_command():
         assert f"  {name:16}{line}" in overview()
 
 
-def test_every_module_of_the_room_is_a_command():
-    room = REPO / "rcirl_jax" / "cli"
-    files = room.glob("*.py")
-    names = {
-        ".".join(file.relative_to(room).with_suffix("").parts)
-        for file in files
-        if file.name not in ("__init__.py", "flags.py", "rcirl.py", "running.py")
-    }
-    assert names == {module for module, _ in COMMANDS.values()}
-
-
 # A command of our own that prints more than a buffer holds
 PRINTS = """
 from rcirl_jax.cli import running
@@ -113,15 +99,10 @@ running.run(main)
 """
 
 
-@pytest.mark.parametrize("joined", [False, True], ids=["stdout", "both"])
 @pytest.mark.parametrize(
-    "words",
-    [
-        ["-m", "rcirl_jax", "train", "--helpfull"],
-        ["-m", "rcirl_jax", "help"],
-        ["-c", PRINTS],
-    ],
-    ids=["help", "overview", "main"],
+    ("words", "joined"),
+    [(["-m", "rcirl_jax", "train", "--helpfull"], False), (["-c", PRINTS], True)],
+    ids=["help", "main"],
 )
 def test_output_that_nobody_reads_ends_without_a_word(words, joined):
     """As behind `| head`; what is written is more than a buffer holds."""
@@ -147,27 +128,6 @@ def test_output_without_room_is_one_line():
     assert "No space left on device" in line
 
 
-def test_without_any_output_a_command_runs():
-    """As after `>&-`: Python has no stdout then."""
-    done = subprocess.run(
-        [sys.executable, "-c", "import sys; sys.stdout = None\n" + PRINTS],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-
-
-def test_another_broken_pipe_is_one_line(monkeypatch, capfd):
-    def broken():
-        raise BrokenPipeError(32, "Broken pipe", "worker")
-
-    monkeypatch.setattr(running.app, "run", lambda main, **_: main(["rcirl"]))
-    monkeypatch.setattr(running.interrupts, "install", lambda: None)
-    with pytest.raises(SystemExit) as stop:
-        running.run(broken)
-    assert stop.value.code == 2
-    assert capfd.readouterr().err == "error: worker: Broken pipe\n"
-
-
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_fits_and_has_the_usual_flags_only(name, every):
     short, full, _ = every[name]
@@ -181,14 +141,6 @@ def test_help_fits_and_has_the_usual_flags_only(name, every):
     assert len(flags) == len(usual) + int(hidden)
     assert "--flagfile=FILE" in short
     assert "--flagfile=FILE" in full
-
-
-def test_flags_beyond_the_usual_stand_under_their_subject(every):
-    _, text, _ = every["autotune"]
-    subject = "The gate: what it takes for a loss and for a gain:"
-    gate = "min_ttc_margin"
-    assert gate in text[text.index(subject) :]
-    assert gate not in text[: text.index(subject)]
 
 
 def test_defaults_are_those_of_the_recipe(every):
@@ -218,12 +170,8 @@ def test_a_flag_that_is_missing_is_named_with_an_example(name, every):
     ("words", "message"),
     [
         ("import --output={out}", "--input: not given: expected a file or folder"),
-        ("train --data=x", "error: --output: not given: expected folder of the run"),
         ("tune", "tune: unknown: expected one of autotune, "),
-        ("import --format=cvs", "did you mean csv?"),
         ("import --stride=far", "--stride: far: expected a number"),
-        ("rank --horizon=9", "--horizon: 9: expected a number in the range [0.4"),
-        ("sweep --trials=0", "--trials: 0: expected a positive integer"),
         ("sweep --trails=9", "Did you mean: trials"),
         ("rank --flagfile=nix", "error: --flagfile: nix: No such file or directory: "),
     ],
@@ -258,14 +206,6 @@ def test_the_package_is_the_command():
     assert "rcirl rank" in command("rcirl_jax", "rank", "--help").stdout
     assert succeeded("rcirl_jax", "--help").stdout.strip() == overview()
     assert succeeded("rcirl_jax", "--version").stdout.strip().endswith(__version__)
-
-
-def test_the_script_is_the_package():
-    scripts = entry_points(group="console_scripts", name="rcirl")
-    if not scripts:
-        pytest.skip("not installed: make setup")
-    (script,) = scripts
-    assert script.value == "rcirl_jax.cli.rcirl:main"
 
 
 MAIN = """
@@ -311,7 +251,7 @@ def test_a_count_or_a_share_is_left_out(text, found):
     assert left_out(text) == found
 
 
-@pytest.mark.parametrize("text", ["-1", "0.5", "100%", "-3%", "few", "nan%", ""])
+@pytest.mark.parametrize("text", ["-1", "100%", "nan%", ""])
 def test_other_words_are_refused(text):
     with pytest.raises(InputError, match=r"--leave_out: .*expected a count"):
         left_out(text)

@@ -1,10 +1,8 @@
 """What is released: locked versions, the wheel's files, the commit it reports."""
 
-import json
 import re
 import shutil
 import subprocess
-import sys
 import tomllib
 from zipfile import ZipFile
 
@@ -99,35 +97,6 @@ def test_what_the_project_asks_for_is_locked_once(name, extra, version):
 def test_users_get_the_versions_that_are_tested():
     tested = {(pin.name, str(pin.specifier)) for pin, _ in pins("test")}
     assert {(pin.name, str(pin.specifier)) for pin, _ in pins("all")} <= tested
-
-
-NONE = "error: audit: 1 of 1 locked versions not audited"
-FOUND = {"vulns": [{"id": "X-1", "fix_versions": ["2.0.1"]}]}
-
-
-@pytest.mark.parametrize(
-    ("answer", "status", "said"),
-    [
-        (FOUND, 1, "numpy 2.0.0: X-1, fixed in 2.0.1"),
-        ({"skip_reason": "none"}, 2, NONE),
-    ],
-)
-def test_an_audit_that_nobody_answers_is_not_passed(tmp_path, answer, status, said):
-    """With a pip-audit of our own making beside the Python."""
-    numpy = {"name": "numpy", "version": "2.0.0", **answer}
-    told = json.dumps({"dependencies": [numpy]})
-    tool, lock = tmp_path / "pip-audit", tmp_path / "a.lock"
-    tool.write_text(f"#!/bin/sh\necho '{told}'\n")
-    tool.chmod(0o755)
-    (tmp_path / "python").symlink_to(sys.executable)
-    lock.write_text("numpy==2.0.0 ; python_version < '3.12' \\\n    --hash=sha256:0\n")
-    done = subprocess.run(
-        [tmp_path / "python", REPO / ".ci" / "audit.py", lock],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == status, done.stderr
-    (line,) = (done.stdout + done.stderr).splitlines()
-    assert said in line
 
 
 def test_the_wheel_holds_what_the_package_reads(tmp_path):
