@@ -70,14 +70,6 @@ def test_mlflow(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["run"]  # nothing beside it
 
 
-def test_wandb_stays_offline(tmp_path, monkeypatch):
-    pytest.importorskip("wandb")
-    monkeypatch.delenv("WANDB_MODE", raising=False)
-    track("wandb", tmp_path)
-    [folder] = (tmp_path / "wandb").glob("offline-run-*")
-    assert list(folder.glob("run-*.wandb"))
-
-
 def test_an_unknown_or_missing_tracker_is_one_line(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"trackers: comet: expected some of"):
         trackers(["comet"], tmp_path)
