@@ -52,7 +52,8 @@ def built(*targets):
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        # without optimization, which takes the compiler three times as long
-        configured(folder, "-DRCIRL_SANITIZE=ON", "-DCMAKE_CXX_FLAGS_RELEASE=-O0")
+        if not (folder / "CMakeCache.txt").exists():
+            # without optimization, which takes the compiler three times as long
+            configured(folder, "-DRCIRL_SANITIZE=ON", "-DCMAKE_CXX_FLAGS_RELEASE=-O0")
         run("cmake", "--build", folder, "--parallel", 2, "--target", *targets)
     return folder

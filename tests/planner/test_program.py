@@ -1,6 +1,5 @@
 """A planner that is a program: as the built-in one, and what may go wrong with it."""
 
-import json
 import sys
 from pathlib import Path
 
@@ -18,7 +17,6 @@ from rcirl_jax.planner.program import (
     check_program,
     processes_of,
     program,
-    scene_line,
 )
 from rcirl_jax.simulation.metrics import not_driven
 from rcirl_jax.simulation.rollout import first_scenes
@@ -158,23 +156,6 @@ def test_what_is_no_plan_is_one_line(kind, line):
 def test_what_does_not_speak_the_protocol_is_one_line(command, line):
     with pytest.raises(InputError, match=line):
         program(f"planner:{command}")
-
-
-def test_what_is_sent_of_a_scene():
-    scenes = jax.tree.map(np.asarray, first_scenes(build(refs(), 1.0)))
-    for i in range(10):
-        scene = jax.tree.map(lambda x, i=i: x[i], scenes)
-        sent = json.loads(scene_line(scene, CASE, 3))
-        assert (sent["case"], sent["step"]) == (CASE, 3)
-        given = sent["scene"]
-        assert given["ego"]["s"] == 0.0
-        assert given["ego"]["v"] == scene.ego.v
-        assert given["path"]["speed_limit"] == scene.path.speed_limit.tolist()
-        there = (scene.obstacles.kind > 0) & scene.obstacles.valid.any(axis=1)
-        assert len(given["obstacles"]) == there.sum()
-        for body, slot in zip(given["obstacles"], np.flatnonzero(there), strict=True):
-            assert body["s_lower"] == scene.obstacles.s_lower[slot].tolist()
-            assert body["kind"] in {"VEHICLE", "STATIC", "STOP", "VIRTUAL"}
 
 
 def test_the_table_says_how_many_cases_were_not_driven_and_nothing_ships():
