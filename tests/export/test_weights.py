@@ -260,15 +260,3 @@ def test_samples_of_other_weights_are_refused():
     none = (features[:0], valid[:0], values[:0])
     with pytest.raises(InputError, match=r"features.shape: \[0, 4, 3\]: expected"):
         pack(weights, *none)
-
-
-@pytest.mark.parametrize("where", ["folder", "file/weights"])
-def test_bad_places_are_one_line(tmp_path, where):
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "file").write_text("x")
-    weights = example_weights()
-    with pytest.raises(InputError) as caught:
-        save(tmp_path / where, weights, *example_samples(weights))
-    assert str(caught.value).startswith(f"{tmp_path / where}: path: ")
-    assert "\n" not in str(caught.value)
-    assert len(list(tmp_path.rglob("*"))) == 2

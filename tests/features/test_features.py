@@ -141,8 +141,8 @@ def test_running_a_red_light_counts_once_and_only_on_red():
         line = {"kind": Kind.STOP, "length": 0.0, "width": 40.0}
         made = scene(v=v, boxes=[{"s": 30.0, "valid": valid, **line}])
         s = v * jnp.asarray(TIMES_S)
-        drive = trajectory_from_positions(made, s, jnp.zeros_like(s))
-        return np.asarray(features(made, drive))[:, column]
+        drive = FROM_POSITIONS(made, s, jnp.zeros_like(s))
+        return np.asarray(JITTED["paper21"](made, drive))[:, column]
 
     assert (closest(10.0, red) < 0.0).sum() == 1
     assert (closest(10.0, ~red) < 0.0).sum() == 0

@@ -20,12 +20,6 @@ def test_a_lower_sign_is_braked_for():
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
-def test_a_higher_sign_counts_from_where_it_stands():
-    posted = np.where(np.arange(12) < 5, 8.0, 20.0)
-    found = planning_limit(FLAT, FLAT, posted, 2.0)
-    np.testing.assert_allclose(found, posted, atol=1e-12)
-
-
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_curve_of_50_m_is_driven_at_10_mps(side):
     """sqrt(2 m/s^2 * 50 m) = 10 m/s, whichever way it bends."""

@@ -4,7 +4,6 @@ Built with the sanitizers, so a read past the end of any file here is a failure;
 allocation over 256 MB too. Needs cmake, a C++17 compiler and msgpack-c's C headers.
 """
 
-import dataclasses
 import os
 import shutil
 import struct
@@ -148,33 +147,6 @@ def test_a_thousand_plans_get_the_guard_of_python(programs, tmp_path, data):
             assert bool(int(row[0])) == verdict.in_distribution
             assert reward.names[int(row[1])] == verdict.feature
             assert float(row[2]) == verdict.share
-
-
-@pytest.mark.parametrize(("mode", "with_prior"), [(None, True), ("path_speed", False)])
-def test_a_reward_says_what_it_is_for_as_in_python(
-    programs, tmp_path, mode, with_prior
-):
-    path = tmp_path / "weights.msgpack"
-    made = example_weights(features=3, times=3, hidden=(4,), with_prior=with_prior)
-    upper = np.where(np.arange(3) == 1, made.lower, made.upper)  # one never varied
-    provenance = {k: v for k, v in made.provenance.items() if k != "mode"}
-    provenance |= {} if mode is None else {"mode": mode}
-    made = dataclasses.replace(made, upper=upper, provenance=provenance)
-    reward = save(path, made, *example_samples(made))
-    told = run(programs / "reader", "describe", path).decode()
-    assert told == reward.describe() + "\n"
-    lateral = mode == "path_speed"
-    assert reward.mode == ("path_speed" if lateral else "speed")
-    lines = told.splitlines()
-    trained = "was trained" if lateral else "was not trained"
-    assert lines[:2] == [
-        f"mode: {reward.mode}: l {trained}",
-        f"features without effect: {reward.names[1]}",
-    ]
-    assert lines[2].startswith("prior cost: ")
-    assert (", gain " in lines[2]) == with_prior
-    assert lines[3].startswith("times: 3 from 0 to ")
-    assert lines[4] == "safety: none: filter the candidates before you choose"
 
 
 def test_damaged_files_are_refused_with_one_line(programs, tmp_path):

@@ -31,14 +31,14 @@ def test_the_value_counts_as_much_as_the_gain_says(tmp_path):
     scene = random_scene(3)
     candidates = sampled(jax.random.key(0), scene, ONLINE)
     score, params = score_of(reward)
-    ours = learned_score(FEATURES, reward.activation)(
+    ours = jax.jit(learned_score(FEATURES, reward.activation))(
         reward_params(reward), scene, candidates
     )
-    theirs = hand_score(None, scene, candidates)
+    theirs = jax.jit(hand_score)(None, scene, candidates)
     found = jax.jit(score)(params, scene, candidates)
     np.testing.assert_allclose(found, theirs + gain * ours, rtol=1e-4, atol=1e-4)
     # the planner's side computes the same from features and its own cost
-    features = np.asarray(FEATURES.of_candidates(scene, candidates))
+    features = np.asarray(jax.jit(FEATURES.of_candidates)(scene, candidates))
     valid = np.broadcast_to(np.asarray(scene.time_valid), features.shape[:2])
     total = reward.total(features, np.asarray(theirs), valid)
     np.testing.assert_allclose(total, found, rtol=1e-4, atol=1e-3)

@@ -22,7 +22,6 @@ from rcirl_jax.report.replays import _broken_words, goes_as
 from rcirl_jax.report.tuning_page import cards, outcome_of
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.metrics import COLUMNS
-from rcirl_jax.units import TIMES_S
 from tests.report.test_data_page import HOSTILE, Page
 from tests.report.tuning_case import PLAYED, WARNINGS
 
@@ -230,17 +229,6 @@ def test_the_papers_table_is_the_suites(page, report):
     assert float(comfort[0]) == pytest.approx(physical["rms_a"], abs=0.005)
     assert safety[:4] == ["12", "0", "0", "12"]
     assert f"{suite.rows['candidate'].at_fault}" == "12"
-
-
-def test_ranking_and_gamma_are_the_reports(page, report):
-    cells = rows(page, "ranking")["candidate"][0]
-    estimate = report.ranking.rows["candidate"]["top1_fde"]
-    assert cells[2] == f"{estimate.value:.2f} [{estimate.low:.2f}, {estimate.high:.2f}]"
-    table = rows(page, "gamma")
-    for place, reward in enumerate(report.rewards.values()):
-        gamma = reward.gamma * np.sign(reward.gamma.sum())
-        shown = [number(table[f"{t:.2f}"][0][place]) for t in TIMES_S]
-        assert shown == pytest.approx(gamma / np.abs(gamma).max(), abs=6e-4)
 
 
 def test_a_linear_rewards_shares_are_its_terms(report):

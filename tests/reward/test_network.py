@@ -163,19 +163,6 @@ def test_acceleration_and_jerk_at_the_start_set_no_gate():
     np.testing.assert_allclose(found, plain, rtol=1e-5, atol=1e-5)
 
 
-def test_the_gradient_reaches_the_gating_from_zero():
-    def gap(params):
-        found = values(params, trajectories(), GATED)
-        return found[0] - found[1]
-
-    params = init_params(jax.random.key(3), F, GATED)
-    slope = np.asarray(jax.grad(gap)(params)["scene_gating"])
-    masked = np.asarray(FEATURES.context) == 0
-    assert np.isfinite(slope).all()
-    assert not slope[masked].any()
-    assert np.abs(slope[~masked]).max() > 1e-4
-
-
 @pytest.mark.parametrize(
     ("given", "says"),
     [

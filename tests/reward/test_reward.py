@@ -42,10 +42,9 @@ def test_normaliser_is_robust_and_never_divides_by_little():
 def test_lattice_cost_prefers_what_it_should():
     """Cruising at the limit beats crawling; braking for a wall beats hitting it."""
 
+    @jax.jit
     def cost(made, s):
-        return float(
-            lattice_cost(made, trajectory_from_positions(made, s, jnp.zeros(T)))
-        )
+        return lattice_cost(made, trajectory_from_positions(made, s, jnp.zeros(T)))
 
     free = scene(v=20.0, speed_limit=20.0)
     t = jnp.asarray(TIMES_S)
@@ -59,6 +58,7 @@ def test_lattice_cost_prefers_what_it_should():
 def test_costs_of_all_candidates_are_those_of_each():
     scene = random_scene(5)
     candidates = sampled(jax.random.key(1), scene, SamplerConfig())
-    each = jax.vmap(lambda x: lattice_cost(scene, x))(candidates.trajectory)
-    together = lattice_costs(scene, candidates.trajectory)
+    of_each = jax.jit(jax.vmap(lattice_cost, in_axes=(None, 0)))
+    each = of_each(scene, candidates.trajectory)
+    together = jax.jit(lattice_costs)(scene, candidates.trajectory)
     np.testing.assert_allclose(together, each, rtol=1e-5, atol=1e-5)

@@ -4,9 +4,7 @@ import os
 
 import jax
 import jax.numpy as jnp
-import pytest
 
-from rcirl_jax.runtime import compiling
 from rcirl_jax.runtime.compiling import compiles, use_cache
 
 
@@ -30,26 +28,6 @@ def test_compilations_are_heard_inside_the_block_only():
     assert heard >= 2
     assert len(every) == heard
     assert all(seconds > 0.0 for seconds in every)
-
-
-@pytest.mark.parametrize(
-    ("backend", "options", "wanted"),
-    [
-        ("cpu", compiling.WIDE, compiling.WIDE),
-        ("cpu", {"xla_cpu_no_such_option": 1}, None),
-        ("gpu", compiling.WIDE, None),
-    ],
-)
-def test_wide_vectors_are_asked_for_where_xla_knows_them(
-    monkeypatch, backend, options, wanted
-):
-    monkeypatch.setattr(compiling, "WIDE", options)
-    monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    compiling.wide_vectors.cache_clear()
-    try:
-        assert compiling.wide_vectors() == wanted
-    finally:
-        compiling.wide_vectors.cache_clear()
 
 
 def test_the_cache_is_bounded_the_users_own_and_known_to_workers(tmp_path, monkeypatch):

@@ -28,6 +28,9 @@ SAMPLE = {
 }
 
 
+NEGATIVES = jax.jit(hard_negatives, static_argnums=(3, 4))
+
+
 def family(candidates, name):
     return np.flatnonzero(np.asarray(candidates.family) == FAMILIES.index(name))
 
@@ -158,7 +161,7 @@ def test_only_the_random_family_depends_on_the_key():
 def test_hard_negatives_depart_from_the_human_with_time():
     made = scene(v=12.0)
     human = trajectory_on_path(made, 12.0 * jnp.asarray(TIMES_S))
-    near = hard_negatives(jax.random.key(0), made, human, CONFIGS["speed"], 16)
+    near = NEGATIVES(jax.random.key(0), made, human, CONFIGS["speed"], 16)
     apart = np.abs(np.asarray(near.trajectory.s - human.s))
     assert (apart[:, 0] == 0.0).all()
     assert ((apart[:, -1] >= 0.99) & (apart[:, -1] <= 6.01)).all()
@@ -169,7 +172,7 @@ def test_hard_negatives_depart_from_the_human_with_time():
 def test_some_hard_negatives_drift_aside_where_paths_may_be_chosen():
     made = scene(v=12.0)
     human = trajectory_on_path(made, 12.0 * jnp.asarray(TIMES_S))
-    near = hard_negatives(jax.random.key(0), made, human, CONFIGS["path_speed"], 12)
+    near = NEGATIVES(jax.random.key(0), made, human, CONFIGS["path_speed"], 12)
     aside = np.asarray(near.trajectory.l - human.l)
     along = np.asarray(near.trajectory.s - human.s)
     drifts = np.isin(np.arange(12), [4, 5, 10, 11])

@@ -47,19 +47,6 @@ def test_braking_is_capped_and_delayed():
     assert first[1] - first[0] == pytest.approx(6, abs=1)
 
 
-def test_a_lapse_hides_the_leader_for_its_time():
-    slow = leader(3.0)
-    cases = [
-        make_case([slow, follower(v=15.0)], speed=0.0),
-        make_case([slow, follower(v=15.0, lapse_start=0.0, lapse_end=2.0)], speed=0.0),
-    ]
-    _, shot = drive(cases, steps=300)
-    attentive, lapsed = shot.agents.a[0, :, 1], shot.agents.a[1, :, 1]
-    assert attentive[:15].min() < -1.0
-    assert lapsed[:15].min() > -0.6
-    assert lapsed[25:60].min() < -1.0
-
-
 def test_phases_reach_their_speeds_at_their_rates():
     car = {"s": FAR, "v": 10.0, "phases": [(2.0, 4.0, 3.0), (8.0, 12.0, 1.5)]}
     car["reacts"] = False  # a reacting one never exceeds its IDM acceleration

@@ -119,13 +119,6 @@ def test_each_column_sees_its_own_excess(column, changes):
         assert found.holds[other]
 
 
-def test_raw_jerk_of_a_pulse_is_hidden_by_the_filter():
-    found = measured(a=at(50, 0.8))
-    assert not found.holds[COLUMNS.index("j_station")]
-    assert found.holds_filtered[0]
-    assert found.max_j == pytest.approx(8.0, rel=1e-4)
-
-
 def test_a_crash_of_own_fault_fails_every_column_and_the_score():
     found = measured(
         collision=at(60, 1, 0, np.int32),

@@ -14,7 +14,6 @@ from rcirl_jax.simulation.rows import Row, baseline_row
 from rcirl_jax.simulation.world import Vehicle
 from rcirl_jax.simulators.drive import Seen, drive, follow
 from rcirl_jax.simulators.measures import measure
-from rcirl_jax.simulators.simulators import open_simulator
 from rcirl_jax.simulators.table import (
     numbers_of,
     read_results,
@@ -133,11 +132,6 @@ def test_a_table_has_a_row_per_driver_and_paired_differences(driven):
     assert set(body["groups"]) == {"all", "0", "5"}
     for name in driven:
         assert name in text_of(body)
-
-
-def test_an_unknown_simulator_is_one_line():
-    with pytest.raises(InputError, match=r"simulator: sumoo: .*did you mean sumo\?"):
-        open_simulator("sumoo")
 
 
 def test_results_are_read_as_they_were_written(driven, tmp_path):

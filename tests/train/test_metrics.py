@@ -45,13 +45,6 @@ def test_a_damaged_line_is_left_out(tmp_path):
     assert path.read_text() == line(1) + "\n"
 
 
-def test_values_that_are_no_numbers_are_left_out(tmp_path):
-    path = write(tmp_path, [line(1, loss="low", pairs=[1], pair_accuracy=None)])
-    kept = {"step": 1, "queries_per_s": 1.0}
-    assert read_metrics(path) == [kept | {"pair_accuracy": None}]
-    assert last_metrics(tmp_path) == kept
-
-
 def test_pairs_won_are_those_of_the_last_steps(tmp_path):
     lines = [line(1), line(2, pairs=10.0, pair_accuracy=0.5), line(3, pairs=30.0)]
     path = write(tmp_path, lines)

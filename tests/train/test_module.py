@@ -49,8 +49,8 @@ def test_it_drives_by_the_value_that_is_trained():
     assert score is module_score(FEATURES, model)  # or a rollout compiles again
     weights, planner = (state.params, state.normaliser), RankConfig()
     candidates = sampled(key, scene, planner.sampler)
-    scores = score(weights, scene, candidates)
-    x = FEATURES.of_candidates(scene, candidates)
+    scores = jax.jit(score)(weights, scene, candidates)
+    x = jax.jit(FEATURES.of_candidates)(scene, candidates)
     valid = jnp.broadcast_to(scene.time_valid, x.shape[:2])
     want = value(model, state.params, state.normaliser, x, valid)
     np.testing.assert_allclose(scores, want, rtol=1e-5, atol=1e-5)
