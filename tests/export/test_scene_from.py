@@ -168,8 +168,8 @@ def test_it_is_what_the_observer_sees():
     light = {"kind": LineKind.LIGHT, "s": 90.0, "offset": 12.0, "green": 10.0}
     case = make_case(agents, [light | {"yellow": 1.0, "red": 60.0}], lanes=(1, 1))
     case = jax.tree.map(jnp.asarray, case)
-    world = start(case)
-    seen = observe(case, world, road_limit(case.road))
+    world = jax.jit(start)(case)
+    seen = jax.jit(lambda *now: observe(*now, road_limit(now[0].road)))(case, world)
     own = float(world.ego.s)
     made = scene_from(
         ego=Car(x=own, y=0.0, heading=0.0, speed=10.0, length=4.933, width=2.11),
