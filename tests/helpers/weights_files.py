@@ -164,6 +164,10 @@ def trained_network(hidden, activation, scene_gating, count):
     config = RewardConfig(hidden=hidden, activation=activation, scene_gating=context)
     raw = init_params(jax.random.key(5), size, config)
     raw["gamma"] = jnp.asarray(rng.normal(size=18), jnp.float32)
+    for layer in raw["point"].values():
+        if "bias" in layer:
+            drawn = rng.normal(size=layer["bias"].shape)
+            layer["bias"] = jnp.asarray(drawn, jnp.float32)
     if scene_gating:
         drawn = rng.normal(scale=0.2, size=(size, size))
         raw["scene_gating"] = jnp.asarray(drawn, jnp.float32)
