@@ -22,8 +22,8 @@ positive = "nearest"
 [simulated_demonstrations]
 expert = "own cost"
 cases = 1
-duration_s = 45.0
-stride_s = 8.0
+duration_s = 20.0
+stride_s = 4.0
 [prior_cost]
 gain = 1.1
 """
