@@ -4,8 +4,9 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from rcirl_jax.data.formats import files_of, format_of, parts, pieces, read_part
+from rcirl_jax.data.formats import files_of, parts, pieces, read_part
 from rcirl_jax.data.formats.files import is_long_file
+from rcirl_jax.data.formats.format import FORMATS
 from rcirl_jax.data.recording import LEAVE_OUT, PIECE, refusal
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording
@@ -89,7 +90,7 @@ def is_long(file: InputFile) -> bool:
     """Return whether a file's recordings may be too many to be held at once."""
     if PIECE in file.spec:
         return False
-    form = format_of(file.format)
+    form = FORMATS[file.format]
     if form.is_cut:
         return is_long_file(file.input, file.spec)
     if form.shard_bytes and file.input.is_file():

@@ -1,11 +1,9 @@
 """Logs as tests read them: recordings, or the one line that refuses them."""
 
-import importlib
-
 import pytest
 
 from rcirl_jax.data import importing
-from rcirl_jax.data.formats import read_recordings
+from rcirl_jax.data.formats import module_of, read_recordings
 from rcirl_jax.data.formats.options import USER_KEYS
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
@@ -21,9 +19,8 @@ def read(form, path, source=None, **options):
     """All recordings of an input; `options` take the place of packaged ones."""
     if not options:
         return list(read_recordings(form, path, source))
-    reader = importlib.import_module(f"rcirl_jax.data.formats.{form}.reader")
     spec = {**packaged(form), **options, USER_KEYS: sorted(options)}
-    return list(reader.recordings(path, spec))
+    return list(module_of(form).recordings(path, spec))
 
 
 def only(form, path, source=None, **options):

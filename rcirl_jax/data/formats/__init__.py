@@ -1,10 +1,9 @@
-"""Importers: one folder per log format, each yielding valid Recordings.
+"""Importers: one module per log format, each yielding valid Recordings.
 
-A folder with a `reader` is a format; its `FORMAT` (see `format`) says how its files are
-recognised and how workers share them. The reader has `recordings`: (input path, source
-spec) -> iterator of Recording. The spec is the TOML of data_specs/sources (or the
-user's own). Each passes its recordings through `validate_recording` with the file's
-name.
+`format.FORMATS` says how a format's files are recognised and how workers share them.
+Its module has `recordings`: (input path, source spec) -> iterator of Recording. The
+spec is the TOML of data_specs/sources (or the user's own). Each passes its recordings
+through `validate_recording` with the file's name.
 """
 
 import importlib
@@ -16,7 +15,7 @@ from pathlib import Path
 
 from rcirl_jax.data.formats.declared import over_packaged
 from rcirl_jax.data.formats.files import log_name, with_log_names
-from rcirl_jax.data.formats.format import Format
+from rcirl_jax.data.formats.format import FORMATS
 from rcirl_jax.data.formats.options import USER_KEYS, check_options
 from rcirl_jax.data.formats.sites import BESIDE, beside, with_roads
 from rcirl_jax.data.readers.tables.rows import NoRowsError
@@ -29,10 +28,7 @@ from rcirl_jax.types import Recording
 
 Importer = Callable[[Path, dict], Iterator[Recording]]
 
-# a folder each, whose `reader` is loaded only when the format is asked for
-IMPORTERS = tuple(
-    sorted(file.parent.name for file in Path(__file__).parent.glob("*/reader.py"))
-)
+IMPORTERS = tuple(FORMATS)  # their modules are loaded when they are asked for
 
 
 def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
@@ -64,14 +60,9 @@ def files_of(name: str, path: Path) -> list[Path]:
     return [path] if found is None else found(path)
 
 
-def format_of(name: str) -> Format:
-    """Returns what a format says of itself, without its reader."""
-    return importlib.import_module(f"{__name__}.{name}").FORMAT
-
-
-def module_of(name: str, module: str = "reader") -> types.ModuleType:
-    """Loads a module of a format's folder."""
-    return importlib.import_module(f"{__name__}.{name}.{module}")
+def module_of(name: str) -> types.ModuleType:
+    """Loads the module of a format."""
+    return importlib.import_module(f"{__name__}.{FORMATS[name].module or name}")
 
 
 def parts(
@@ -100,7 +91,7 @@ def parts(
     own = [] if source is None else sorted(spec)
     options = f"options as in the TOML of format {name}"
     if source is not None:
-        form, usual = format_of(name), load_toml(packaged)
+        form, usual = FORMATS[name], load_toml(packaged)
         with as_input_error(str(source), options):
             check_options(spec, usual, form)
         if name not in ("csv", "synthetic"):  # what they do not say is no default

@@ -5,8 +5,9 @@ import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
-from rcirl_jax.data.formats import IMPORTERS, format_of, module_of
+from rcirl_jax.data.formats import IMPORTERS, module_of
 from rcirl_jax.data.formats.files import is_input
+from rcirl_jax.data.formats.format import FORMATS
 from rcirl_jax.data.readers.tables.table import open_table
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml, spec_root
@@ -31,7 +32,7 @@ def recognised_format(path: Path | None, source: Path | None = None) -> str:
         raise InputError(f"{path}: input: missing: expected a file or folder")
     found: dict[str, Path] = {}
     # the input, or what is in the folder: those whose names say most first
-    names = (name for form in IMPORTERS for name in format_of(form).names)
+    names = (name for form in FORMATS.values() for name in form.names)
     below = _matching(path, (*names, *TABLES)) if path.is_dir() else ()
     possible = (file for file in below if file.is_dir() or is_input(path, file))
     for file in itertools.islice(itertools.chain([path], possible), MAX_FILES):
@@ -79,8 +80,7 @@ def _matching(path: Path, patterns: tuple[str, ...]) -> Iterator[Path]:
 
 def _format_of(file: Path, source: Path | None) -> str:
     """The format of one file or folder, "" where it is none that is known."""
-    forms = {name: format_of(name) for name in IMPORTERS}
-    for name, form in forms.items():
+    for name, form in FORMATS.items():
         if any(map(file.match, form.names)):
             return "" if file.suffix == ".toml" and _is_source(file) else name
     if not file.is_file():
@@ -89,11 +89,11 @@ def _format_of(file: Path, source: Path | None) -> str:
     with contextlib.suppress(InputError):
         table = open_table(file)
     header = {name.lower() for name in table.header} if table else set()
-    for name, form in forms.items():
+    for name, form in FORMATS.items():
         if any(columns <= header for columns in form.columns):
             return name
-    for name, form in forms.items():  # told by more than columns
-        if form.told_by and module_of(name, form.told_by).is_log(file, table):
+    for name, form in FORMATS.items():  # told by more than columns
+        if form.has_is_log and module_of(name).is_log(file, table):
             return name
     packaged = load_toml(spec_root() / "sources" / "csv.toml")["columns"]
     needed = {packaged[field] for field in ("t", "id", "x", "y")}

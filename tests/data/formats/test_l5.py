@@ -6,9 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from rcirl_jax.data.formats import parts, read_recordings
-from rcirl_jax.data.formats.l5 import map as l5_map
-from rcirl_jax.data.formats.l5 import reader as l5
+from rcirl_jax.data.formats import l5, parts, read_recordings
 from rcirl_jax.data.importing import digest
 from tests.data.formats.fixtures import l5 as fixture
 from tests.helpers import logs
@@ -20,7 +18,7 @@ X, Y = fixture.CENTRE
 
 
 def map_of(file):
-    return l5_map.SemanticMap(file, l5_map.world_to_ecef(file, PACKAGED))
+    return l5.SemanticMap(file, l5.world_to_ecef(file, PACKAGED))
 
 
 def lanes_around(semantic_map):

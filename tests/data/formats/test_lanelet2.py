@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from rcirl_jax.data.formats.lanelet2.map import read_lanelet2
+from rcirl_jax.data.formats.lanelet2 import read_lanelet2
 from rcirl_jax.data.formats.projection import utm
 from tests.data.formats.fixtures import osm
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import shapely
 
-from rcirl_jax.data.formats.nuplan import map as geopackage
-from rcirl_jax.data.formats.nuplan import reader as nuplan
+from rcirl_jax.data.formats import nuplan
 from tests.data.formats.fixtures import nuplan as fixture
 from tests.data.formats.fixtures.nuplan import edit
 from tests.helpers import logs
@@ -204,7 +203,7 @@ GEOMETRIES = [
 
 @pytest.mark.parametrize(("content", "points"), GEOMETRIES)
 def test_geometries(content, points):
-    np.testing.assert_array_equal(geopackage.points_of(content), points)
+    np.testing.assert_array_equal(nuplan.points_of(content), points)
 
 
 MALFORMED = [
@@ -216,7 +215,7 @@ MALFORMED = [
 @pytest.mark.parametrize("content", MALFORMED)
 def test_malformed_geometries(content):
     with pytest.raises(ValueError, match=r"\w"):
-        geopackage.points_of(content)
+        nuplan.points_of(content)
 
 
 def test_missing_velocity_comes_from_positions(log):

@@ -6,32 +6,33 @@ import sys
 
 import pytest
 
-from rcirl_jax.data.formats import IMPORTERS, format_of
+from rcirl_jax.data.formats import IMPORTERS
+from rcirl_jax.data.formats.format import FORMATS
 from rcirl_jax.data.formats.options import check_options
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from tests.helpers.logs import packaged, refused
 
-FORMATS = pytest.mark.parametrize("name", IMPORTERS)
+EVERY = pytest.mark.parametrize("name", IMPORTERS)
 COMMENTED = re.compile(r"(?m)^# ([a-z]\w*) = ")  # an option that is left out
 
 
 def check(name, spec):
-    check_options(spec, packaged(name), format_of(name))
+    check_options(spec, packaged(name), FORMATS[name])
 
 
-@FORMATS
+@EVERY
 def test_the_packaged_options_are_known(name):
     """Also those that stand in its comments."""
     check(name, packaged(name))
     text = (spec_root() / "sources" / f"{name}.toml").read_text()
-    known = {**packaged(name), **format_of(name).options}
+    known = {**packaged(name), **FORMATS[name].options}
     tables = {n for value in known.values() if isinstance(value, dict) for n in value}
     commented = set(COMMENTED.findall(text)) - tables - {"vx", "automated"}
     assert commented <= known.keys()
 
 
-@FORMATS
+@EVERY
 def test_a_misspelt_option_is_refused(name):
     for key in packaged(name):
         line = refused(check, name, {f"{key}x": packaged(name)[key]})
@@ -39,10 +40,10 @@ def test_a_misspelt_option_is_refused(name):
         assert line.endswith(f"; did you mean {key}?")
 
 
-@FORMATS
+@EVERY
 def test_a_misspelt_name_in_a_table_is_refused(name):
     """Unless names are free there: classes of road users, columns, models of cars."""
-    form = format_of(name)
+    form = FORMATS[name]
     for key, value in {**packaged(name), **form.options}.items():
         tables = value if isinstance(value, list) else [value]
         for table in (one for one in tables if isinstance(one, dict) and one):
@@ -81,14 +82,10 @@ def test_types_of_options_that_a_packaged_file_leaves_out(name, option):
 
 def test_what_formats_say_is_cheap_to_read():
     """Their readers, and what these need, are loaded when they are asked for."""
-    code = (
-        "import sys; from rcirl_jax.data.formats import IMPORTERS, format_of; "
-        "[format_of(name) for name in IMPORTERS]; print(*sys.modules)"
-    )
+    code = "import sys, rcirl_jax.data.formats; print(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     loaded = set(done.stdout.split())
-    assert "rcirl_jax.data.formats.waymo" in loaded
     heavy = {"pyarrow", "google.protobuf", "shapely", "mcap", "tensorstore"}
-    assert not loaded & {*heavy, "rcirl_jax.data.formats.waymo.reader"}
+    assert not loaded & {*heavy, "rcirl_jax.data.formats.waymo"}

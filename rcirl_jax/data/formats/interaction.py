@@ -21,7 +21,7 @@ import numpy as np
 
 from rcirl_jax.data.formats.declared import KINDS, open_log, track_of, unknown_kinds
 from rcirl_jax.data.formats.files import files_below, given_map, is_input, log_name
-from rcirl_jax.data.formats.lanelet2.map import read_lanelet2
+from rcirl_jax.data.formats.lanelet2 import read_lanelet2
 from rcirl_jax.data.formats.options import number
 from rcirl_jax.data.formats.perception import SIZES_M
 from rcirl_jax.data.formats.projection import utm, utm_zone

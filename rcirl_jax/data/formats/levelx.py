@@ -28,7 +28,7 @@ from rcirl_jax.data.formats.declared import (
     unknown_kinds,
 )
 from rcirl_jax.data.formats.files import files_below, given_map, log_name
-from rcirl_jax.data.formats.lanelet2.map import read_lanelet2
+from rcirl_jax.data.formats.lanelet2 import read_lanelet2
 from rcirl_jax.data.formats.lanes import StraightLane, parallel_lane
 from rcirl_jax.data.formats.options import number
 from rcirl_jax.data.formats.projection import utm, utm_zone

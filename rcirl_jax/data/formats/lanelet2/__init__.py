@@ -1,1 +1,0 @@
-"""Lanelet2 maps, shared by formats: `map` reads OSM XML, `rules` what it means."""
