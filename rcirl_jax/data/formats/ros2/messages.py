@@ -195,9 +195,7 @@ def _obstacle(
 def _autoware(pose: str, twist: str) -> Reader:
     """TrackedObjects and PredictedObjects of Autoware; paths are not read.
 
-    Args:
-      pose: leads from an object's kinematics to its pose.
-      twist: to its velocity in its own frame.
+    `pose` leads from an object's kinematics to its pose, `twist` to its own velocity.
     """
     pose_of, twist_of = attrgetter(pose), attrgetter(twist)
 

@@ -61,14 +61,9 @@ class _Entry(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """Yields all recordings that a TOML file declares.
+    """Yields all recordings that a TOML declares, checked before the first is made.
 
-    Args:
-      path: the file, like data_specs/sources/synthetic.toml.
-      spec: the packaged settings; what `path` does not set is taken from there.
-
-    Raises:
-      InputError: an unknown key or a bad value, before anything is simulated.
+    What it does not set is taken from `spec`, the packaged settings.
     """
     own = load_toml(path)
     # what an import adds says nothing here: none of these is refused

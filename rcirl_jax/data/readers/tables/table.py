@@ -106,11 +106,7 @@ class Table:
         return bool(self._found(column))
 
     def place(self, column: str) -> int:
-        """Returns the number of a column.
-
-        Raises:
-          InputError: it is missing, or met twice.
-        """
+        """Returns the number of a column."""
         found = self._found(column)
         if len(found) == 1:
             return found[0]
@@ -151,10 +147,8 @@ def open_table(
 ) -> Table:
     """Opens a table of any of the forms, its layout recognised.
 
-    Args:
-      path: file.
-      options: [table] of the source TOML, which wins over what is recognised.
-      known: names that the table should hold, which may tell its encoding.
+    `options`, [table] of the source TOML, win; `known` names that the table should hold
+    may tell its encoding.
     """
     if is_columnar(path):
         return Table(path=path, header=tuple(columns_of(path)))
@@ -207,11 +201,8 @@ def batches(
 ) -> Iterator[Batch]:
     """Yields the readable rows of a few MiB in SI units.
 
-    Args:
-      table: of `open_table`.
-      fields: what is read; with `user`, the rows of all users come below each other.
-      stats: counts what is dropped.
-      show: called with the bytes of the file just read.
+    Of fields with `user`, the rows of all users come below each other. `show` is called
+    with the bytes of the file just read.
     """
     places = [table.place(field.column) for field in fields]
     if table.layout is not None:
@@ -399,11 +390,7 @@ def read(table: Table, fields: Sequence[Field], stats: RowStats) -> Rows:
 
 
 def as_texts(table: Table, batch: Batch) -> Rows:
-    """Returns a batch with its texts themselves.
-
-    Raises:
-      InputError: one text is so long that all of them would fill the memory.
-    """
+    """Returns a batch with its texts themselves."""
     made = dict(batch)
     for name, column in batch.items():
         if isinstance(column, tuple):
