@@ -105,20 +105,6 @@ def test_a_stream_cut_into_files(tmp_path, names, edges, options, long_bytes):
     assert both - len(edges) * 2 <= int(found[1]) <= both
 
 
-def test_one_name_in_all_files(tmp_path):
-    logs = cut(tmp_path / "logs", "ab", [60.0])
-    dataset = import_logs(
-        logs, tmp_path / "data", format="csv", test_fraction=0.5, stride_s=4.0
-    )
-    every, vehicles = dataset.load(None), dataset.manifest.vehicles
-    where = {}
-    for vehicle, recording in zip(every.vehicle, every.recording, strict=True):
-        where.setdefault(int(vehicle), set()).add(int(recording))
-    assert sum(len(seen) > 1 for seen in where.values()) > 10
-    bare = [vehicles[v].rpartition(":")[2] for v in where]
-    assert sorted(set(bare)) == sorted(bare)
-
-
 @pytest.mark.parametrize("has_clock", [True, False])
 def test_recordings_of_any_format(tmp_path, has_clock):
     """Groups that a log declares, a place and a time of its own for each recording."""

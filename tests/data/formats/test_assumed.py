@@ -1,13 +1,6 @@
 """What no log says is counted: limits, widths of lanes, sizes of road users."""
 
-import dataclasses
-from pathlib import Path
-
-import numpy as np
-
 from rcirl_jax.data.formats import read_recordings
-from rcirl_jax.data.formats.perception import Boxes, on_clock, tracks_of
-from rcirl_jax.types import Kind
 from tests.data.formats import people
 from tests.data.formats.test_conformance import counts, write
 
@@ -44,26 +37,3 @@ def test_a_table_of_ones_own(tmp_path):
         people.write(tmp_path, table, header), people.spec(tmp_path, header)
     )
     assert counts([made])[2] == 1
-
-
-def test_sizes_that_are_measured_here_and_there():
-    """The median of those that are; one that never is goes by the class."""
-    t = np.arange(21) * 0.1
-    boxes = Boxes(
-        ids=np.zeros(21, int),
-        names=("7",),
-        t=t,
-        x=8.0 * t,
-        y=0.0 * t,
-        heading=0.0 * t,
-        speed=np.full(21, 8.0),
-        length=np.where(np.arange(21) % 2, np.nan, 5.0),
-        width=np.full(21, np.nan),
-        kind=np.full(21, int(Kind.CYCLIST)),
-    )
-    ((track,), notes) = tracks_of(Path("a.log"), on_clock(boxes, 10.0, 0.5), 0.5)
-    assert (track.length, track.width, track.size_assumed) == (5.0, 0.6, True)
-    known = dataclasses.replace(boxes, width=np.full(21, 0.7))
-    ((track,), notes) = tracks_of(Path("a.log"), on_clock(known, 10.0, 0.5), 0.5)
-    assert (track.length, track.width, track.size_assumed) == (5.0, 0.7, False)
-    assert notes == []

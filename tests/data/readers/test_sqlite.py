@@ -42,16 +42,6 @@ def test_a_file_is_left_as_it_is_and_those_beside_it_are_not_read(file):
     assert len(list(file.parent.iterdir())) == 4
 
 
-def test_columns_of_any_name_and_such_as_may_be_missing(file):
-    with sqlite.Database(file) as database:
-        rows = database.table("log", ("x",), 10**6, ('the "shape"', "y"))
-        assert rows[7] == (7.0, b"\0", None)
-        assert "log.y: missing: expected it among x, " in refused(
-            database.table, "log", ("y",), 10**6
-        )
-        assert "log: more than 999 rows" in refused(database.table, "log", ("x",), 999)
-
-
 def test_work_is_bounded(file, monkeypatch):
     """A join without end stops after steps in proportion to the file."""
     monkeypatch.setattr(sqlite, "MIN_STEPS", 1_000_000)
@@ -72,16 +62,3 @@ def test_work_is_bounded(file, monkeypatch):
 )
 def test_only_select_is_authorised(file, sql):
     assert "database: " in refused(numbers, file, sql)
-
-
-@pytest.mark.parametrize("cell", ["'1.5 m'", "x'31'"])
-def test_cells_that_are_no_numbers(file, cell):
-    assert "x: " in refused(numbers, file, f"SELECT {cell} FROM log")
-
-
-def test_files_cut_short_or_of_another_form(file):
-    file.write_bytes(file.read_bytes()[:5000])
-    assert "size: 5000 bytes: expected " in refused(numbers, file)
-    for fill in (b"\0", b"\xff"):
-        file.write_bytes(b"SQLite format 3\x00" + fill * 5000)
-        assert "expected" in refused(numbers, file)

@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rcirl_jax.data.quality import QualityReport, format_quality
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.scenes.tracks import JOINED, SHORT, joined, steady_tracks
@@ -96,23 +95,3 @@ def test_others_are_not_joined(second):
     assert [track.id for track in joined([first, second], 5.0)] == ["1", "2"]
     leader = [car("1", speeding_up(20.0), seconds=5.0), car("2", speeding_up(60.0))]
     assert joined(leader, 5.0) == leader
-
-
-def test_they_are_counted_and_shown():
-    parts = [between(standing(), 0.0, 2.0, "7"), between(standing(), 3.0, 12.0, "8")]
-    flash = between(car("flash", speeding_up(60.0)), 3.0, 3.3)
-    collector = Collector(recording(EGO, *parts, flash), NO_FILTER)
-    report, again = QualityReport(), QualityReport()
-    report.add_recording(collector)
-    again.merge(report.state())
-    again.merge(report.state())
-    assert again.as_dict()["flicker"] == {JOINED: 2, SHORT: 2}
-    assert report.notes == [
-        ("hand", "tracks that flicker: 1 fragments joined, 1 too short")
-    ]
-    assert "1 fragments joined, 1 too short" in format_quality(report.as_dict())
-    assert report.as_dict()["tracks"] == 2
-    # a recording without flicker says nothing
-    quiet = QualityReport()
-    quiet.add_recording(Collector(recording(EGO), NO_FILTER))
-    assert "flicker" not in quiet.as_dict()
