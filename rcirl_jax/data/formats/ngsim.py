@@ -15,6 +15,7 @@ hold every log twice, as text and as CSV, in folders of their own; those of the
 arterials have no column Location to say what they are, but 24 columns.
 """
 
+import collections
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -236,8 +237,8 @@ class _Survey:
     def __init__(self, portions: Iterable[Rows]) -> None:
         self.has_lateral = False  # any lateral position
         self._without: dict[str, set[float]] = {"length": set(), "width": set()}
-        # lane -> different Local_X and how often each is met; ends of Local_Y
-        self._across: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        # lane -> Local_X and how often it is met; ends of Local_Y
+        self._across: dict[int, collections.Counter[float]] = {}
         self._along: dict[int, tuple[float, float]] = {}
         for rows in portions:
             self.has_lateral |= bool(np.any(rows["across"] != 0.0))
@@ -246,13 +247,7 @@ class _Survey:
             driven = rows["lane"].astype(int)
             for lane in np.unique(driven).tolist():
                 x, y = (rows[name][driven == lane] for name in ("across", "along"))
-                values, counts = self._across.get(lane, (x[:0], np.zeros(0, int)))
-                found, more = np.unique(x, return_counts=True)
-                both = np.concatenate([values, found])
-                both, place = np.unique(both, return_inverse=True)
-                total = np.zeros(both.size, np.int64)
-                np.add.at(total, place, np.concatenate([counts, more]))
-                self._across[lane] = both, total
+                self._across.setdefault(lane, collections.Counter()).update(x.tolist())
                 lower, upper = self._along.get(lane, (np.inf, -np.inf))
                 ends = min(lower, float(y.min())), max(upper, float(y.max()))
                 self._along[lane] = ends
@@ -273,7 +268,7 @@ class _Survey:
         for lane, (lower, upper) in sorted(self._along.items()):
             y = -width * (lane - 0.5)
             if self.has_lateral:  # the median of values met several times each
-                values, counts = self._across[lane]
+                values, counts = np.array(sorted(self._across[lane].items())).T
                 last = np.cumsum(counts)
                 middle = np.array([(last[-1] - 1) // 2, last[-1] // 2])
                 middle = values[np.searchsorted(last, middle, side="right")]

@@ -63,16 +63,10 @@ def ego_boxes(
     heading: np.ndarray,
     speed: np.ndarray,
 ) -> Boxes:
-    """Makes boxes of the recording car, id "ego", from its poses.
+    """Makes boxes of the recording car, id "ego", from its poses [n], in SI units.
 
-    Args:
-      spec: source TOML; the table `ego` has the car's measures in m: length, width,
-        and how far ahead of a pose's place the box's centre lies.
-      t: [n] s.
-      x: [n] m.
-      y: [n] m.
-      heading: [n] rad.
-      speed: [n] m/s; NaN: from the positions.
+    The table `ego` of the TOML has its length and width, and how far ahead of a pose's
+    place the box's centre lies. A speed of NaN is that of the positions.
     """
     own = section(spec, "ego")
     ahead_of = "centre_ahead" if "centre_ahead" in own else "rear_axle_to_centre"
