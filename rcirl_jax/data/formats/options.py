@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import PurePosixPath
 
 from rcirl_jax.data.formats.format import Format
 from rcirl_jax.errors import InputError
@@ -13,6 +14,7 @@ from rcirl_jax.units import FOOT_M, MPH_MPS
 LARGEST = 10**18  # of an integer
 # added to a spec: names of the options that the user's own TOML has
 USER_KEYS = "stated"
+MAX_NAME = 255  # bytes of a file's name
 MAX_PATH = 2048  # bytes of a path; systems take 4096, with the folder before it
 UNITS = {
     **{"m": 1.0, "ft": FOOT_M, "km": 1e3, "cm": 1e-2, "mm": 1e-3},
@@ -104,7 +106,11 @@ def patterns(spec: Mapping, default: Sequence[str] = ()) -> tuple[str, ...]:
 
 def is_file_name(text: str) -> bool:
     """True if it names one file in a folder."""
-    return text not in ("", ".", "..") and "/" not in text and "\0" not in text
+    return text not in ("", ".", "..") and "/" not in text and _is_name(text)
+
+
+def _is_name(text: str) -> bool:
+    return "\0" not in text and len(text.encode(errors="replace")) <= MAX_NAME
 
 
 def _is_pattern(item: object) -> bool:
@@ -112,15 +118,17 @@ def _is_pattern(item: object) -> bool:
 
     Each `**` walks all folders below those of the one before it, so it stands once.
     """
-    names = item.split("/") if isinstance(item, str) else [""]
-    names = [name for name in names if name != "**"] if names.count("**") < 2 else [""]
-    return all(is_file_name(name) and "**" not in name for name in names)
+    names = PurePosixPath(item).parts if isinstance(item, str) else ()
+    others = [name for name in names if name != "**"]
+    is_inside = names and len(names) - len(others) < 2
+    return bool(is_inside) and all(is_file_name(n) and "**" not in n for n in others)
 
 
 def path_option(spec: Mapping, key: str) -> str:
     """Returns an option that names a file or folder; "" without one."""
     value = spec.get(key, "")
-    if not isinstance(value, str) or "\0" in value or len(value) > MAX_PATH:
+    names = value.split("/") if isinstance(value, str) and len(value) < MAX_PATH else []
+    if not names or not all(map(_is_name, names)):
         raise InputError(f"source TOML: {key}: {value}: expected a path")
     return value
 
