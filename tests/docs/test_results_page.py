@@ -7,6 +7,8 @@ import subprocess
 import pytest
 
 from benchmarks import remake, tables
+from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.pipeline import code_sha256
 from tests.docs.pages import DOCS, REPO
 
 CITED = re.findall(r"`(\w+)\.json`", (DOCS / "results.md").read_text())
@@ -40,3 +42,22 @@ def test_the_tables_of_a_page_are_those_of_the_files(page):
     text = (DOCS / page).read_text()
     assert tables.PLACE.search(text)
     assert tables.filled(text) == text, "python -m benchmarks.tables"
+
+
+def test_only_what_is_missing_or_old_is_made_and_numbers_keep_five_digits(tmp_path):
+    given, folder = tmp_path / "given.json", tmp_path / "runs"
+    made_by = {"code_sha256": code_sha256()}
+    given.write_text(json.dumps({"x": 1.2345678, "made_by": made_by}))
+    line, files = f"json.tool {given} {{out}}/a.json", {"shift": "a.json"}
+    tiny = remake.Command("tiny", 1, line, files)
+    (folder / "tiny").mkdir(parents=True)
+    assert remake.left_of([tiny], tmp_path) == {"tiny": ["shift.json missing"]}
+    remake.make(tiny, folder, tmp_path, {})
+    assert remake.left_of([tiny], tmp_path) == {}
+    assert json.loads((tmp_path / "shift.json").read_text())["x"] == 1.2346
+    made_by["code_sha256"] = "0" * 64
+    (tmp_path / "shift.json").write_text(json.dumps({"made_by": made_by}))
+    assert remake.left_of([tiny], tmp_path) == {"tiny": ["shift.json of other code"]}
+    given.unlink()
+    with pytest.raises(InputError, match="tiny: its command ended with status"):
+        remake.make(tiny, folder, tmp_path, {})
