@@ -101,8 +101,11 @@ def validate_recording(
 ) -> Recording:
     """Check a recording; references to unknown lanes and signals are dropped.
 
-    One without traffic is no error: an import counts and skips it. Errors name `file`,
-    by default the recording.
+    One without traffic is no error: an import counts and skips it.
+
+    Args:
+      recording: what an importer read.
+      file: named in errors; default: the recording's name.
 
     Raises:
       InputError: the first violation, as "FILE: field: value: expected".

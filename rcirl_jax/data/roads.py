@@ -288,8 +288,12 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
+def _arc(line: np.ndarray) -> np.ndarray:
+    return np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
+
+
 def _evenly(line: np.ndarray, step: float = STEP_M) -> np.ndarray:
-    arc = np.append(0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T)))
+    arc = _arc(line)
     at = np.linspace(0.0, arc[-1], max(round(arc[-1] / step), 2) + 1)
     return np.stack([np.interp(at, arc, x) for x in line.T], axis=1)
 

@@ -33,7 +33,7 @@ from google.protobuf.message import DecodeError
 
 from rcirl_jax.data.formats.files import files_below, log_name
 from rcirl_jax.data.formats.messages import Drive, Row, Window, topics_of
-from rcirl_jax.data.formats.options import patterns
+from rcirl_jax.data.formats.options import one_pattern
 from rcirl_jax.data.formats.perception import UNKNOWN
 from rcirl_jax.data.readers.protobuf import Message, parsers
 from rcirl_jax.data.readers.reading import reading
@@ -79,12 +79,12 @@ class Run:
         self.is_cut = len(known) > len(self.files)
 
 
-def first_parts(folder: Path, wanted: Sequence[str]) -> list[Path]:
+def first_parts(folder: Path, pattern: str) -> list[Path]:
     """Lists the first file of each run of parts at any depth of a folder, sorted."""
-    drives = _drives(files_below(folder, wanted)).values()
+    drives = _drives(files_below(folder, pattern)).values()
     firsts = [f for parts in drives for n, f in parts.items() if n - 1 not in parts]
     if not firsts:
-        raise InputError(f"{folder}: no file is a part: expected cyber records")
+        raise InputError(f"{folder}: no file matches {pattern}: expected cyber records")
     return sorted(firsts)
 
 
@@ -120,7 +120,9 @@ class Record:
     ) -> Iterator[tuple[str, int, memoryview]]:
         """Yields (channel, time ns, content) of the messages on the wanted channels.
 
-        `show` is called with the bytes of each section that has been read.
+        Args:
+          wanted: names of channels.
+          show: called with the bytes of each section that has been read.
         """
         try:
             with self.path.open("rb") as handle:
@@ -343,7 +345,7 @@ def parts(path: Path, spec: dict) -> list[Path]:
     """Lists the first file of each run of parts: runs can be read alone."""
     if path.is_file():
         return [path]
-    return first_parts(path, patterns(spec))
+    return first_parts(path, one_pattern(spec))
 
 
 def files_of(first: Path) -> list[Path]:

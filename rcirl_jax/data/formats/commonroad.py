@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.formats.files import files_below, log_name
-from rcirl_jax.data.formats.options import is_file_name, number, patterns
+from rcirl_jax.data.formats.options import is_file_name, number, one_pattern
 from rcirl_jax.data.formats.shapes import arc_length, fractions, lane_between, resample
 from rcirl_jax.data.formats.tracks import of_one_name
 from rcirl_jax.data.readers.xml import Node, read_xml
@@ -139,6 +139,7 @@ VERSIONS = ("2018b", "2020a")
 GROUPS_UP = 4  # folders above a file in which the table of groups is looked for
 MAX_FILE_BYTES = 512 * 1024**2  # bytes, larger files are refused
 MAX_STEP = 1e6  # of the clock: a day at 10 Hz
+MAX_STANDING = 20_000_000  # samples of standing things: 500 over an hour at 10 Hz
 # roots of what lies beside interactive scenarios: SUMO's files, solutions, other maps
 OTHER_ROOTS = (
     *("net", "routes", "additional", "configuration", "sumoConfiguration"),
@@ -153,6 +154,8 @@ COLOURS = {
     "inactive": "off",
 }
 MAX_DURATION = 1e9  # steps of one phase; sums of phases stay exact
+MAX_GOAL_M = 1e5  # m, all lanelets of one goal together
+MAX_INTERVALS = 5_000_000  # of all lights; 100 lights over a day take a tenth of it
 OBSTACLES = ("obstacle", "dynamicObstacle", "staticObstacle")  # the first in 2018b
 # obstacle types; any other type that moves is a vehicle
 KINDS = {
@@ -169,7 +172,7 @@ KINDS = {
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """Lists the XML files but those of other formats; each can be read alone."""
-    files = files_below(path, patterns(spec))
+    files = files_below(path, one_pattern(spec))
     if path.is_dir():
         files = [file for file in files if _root_of(file) not in OTHER_ROOTS] or files
     return files
@@ -287,6 +290,9 @@ def _read_tracks(root: Node, dt: float) -> tuple[list[Track], list[str]]:
     first = min((float(track.t[0]) for track in tracks), default=0.0)
     last = max((float(track.t[-1]) for track in tracks), default=0.0)
     clock = np.arange(round(first / dt), round(last / dt) + 1) * dt
+    if len(standing) * clock.size > MAX_STANDING:
+        found = f"{len(standing)} static ones over {clock.size} steps"
+        raise root.error("obstacles", found, f"up to {MAX_STANDING} samples")
     for node in standing:
         state = node.child("initialState")
         still = (*_position(state), state.scalar("orientation"), 0.0)
@@ -386,6 +392,7 @@ def _middle(place: Node) -> tuple[float, float] | None:
 
 def _signals(root: Node, dt: float, last: float) -> Iterator[Signal]:
     """Every traffic light's written cycle, unrolled from 0 to after `last` s."""
+    left = MAX_INTERVALS
     for light in root.each("trafficLight"):
         phases = []
         for one in light.each("cycle/cycleElement"):
@@ -405,6 +412,13 @@ def _signals(root: Node, dt: float, last: float) -> Iterator[Signal]:
         # steps; at or before 0
         begin = light.number("cycle/timeOffset", 0.0) % period - period
         turns = max(int((last / dt - begin) // period) + 1, 1)
+        left -= turns * len(phases)
+        if left < 0:
+            raise light.error(
+                "cycle",
+                f"{turns} turns of {len(phases)}",
+                f"up to {MAX_INTERVALS} intervals of all lights",
+            )
         ends = np.cumsum(durations)
         within = np.concatenate([[0.0], ends[:-1]])
         steps = begin + np.arange(turns)[:, None] * ends[-1] + within
@@ -446,6 +460,10 @@ def _goal_point(
     centres = {lane.id: lane.centre for lane in lanes}
     lines = [centres[name] for name in dict.fromkeys(refs) if name in centres]
     arcs = [arc_length(line) for line in lines]
+    total = sum(float(arc[-1]) for arc in arcs)
+    if not total <= MAX_GOAL_M:
+        found = f"lanelets of {total:.0f} m"
+        raise goal.error("goalState", found, f"up to {MAX_GOAL_M:.0f} m")
     if not lines:
         return coasted.tolist()
     dense = []  # about one point a metre

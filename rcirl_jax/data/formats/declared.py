@@ -92,9 +92,15 @@ def track_of(
 ) -> Track:
     """Returns a track of its rows; unknown cells are filled.
 
-    Rows have t [s], x, y [m], perhaps heading [rad], speed [m/s], length, width [m].
-    Headings and speeds by the positions, `standing` [rad] the heading of one that never
-    moves; sizes as of `size_of`.
+    Headings and speeds by the positions, sizes as of `size_of`.
+
+    Args:
+      name: of the track.
+      rows: t [s], x, y [m], perhaps heading [rad], speed [m/s], length, width [m].
+      kind: of the road user.
+      usual: m, its length and width where no row says them.
+      standing: rad, heading of one that never moves, and has no other.
+      **more: other fields of Track.
     """
     t, x, y = (rows[field] for field in ("t", "x", "y"))
     length, width, is_assumed = size_of(rows, usual)

@@ -22,11 +22,12 @@ TABLE_ENDINGS = (".csv", ".tsv", ".txt", ".parquet", ".feather", ".arrow")
 
 
 def files_below(
-    path: Path, wanted: Sequence[str], what: str = "log files"
+    path: Path, patterns: str | Sequence[str], what: str = "log files"
 ) -> list[Path]:
     """Returns the file itself, or those at any depth that match a pattern, sorted."""
     if path.is_file():
         return [path]
+    wanted = [patterns] if isinstance(patterns, str) else patterns
     found = {file for pattern in wanted for file in path.rglob(pattern)}
     files = sorted(file for file in found if is_input(path, file))
     if not files:

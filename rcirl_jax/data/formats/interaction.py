@@ -112,7 +112,7 @@ def parts(path: Path, spec: dict) -> list[Path]:
         if not file.name.startswith(PEDESTRIANS)
         or file.with_name(file.name.replace(PEDESTRIANS, VEHICLES, 1)) not in names
     ]
-    return kept or files_below(path, ["**/*.csv"])
+    return kept or files_below(path, "**/*.csv")
 
 
 def _is_log(path: Path) -> bool:

@@ -27,8 +27,8 @@ from google.protobuf.message import DecodeError
 from rcirl_jax.data.formats.messages import MAX_GAP_S
 from rcirl_jax.data.formats.options import (
     number,
+    one_pattern,
     path_option,
-    patterns,
     positive,
     recording_car,
 )
@@ -113,7 +113,15 @@ class SemanticMap:
     """All lanes of a map in the dataset's world, and the lights' faces."""
 
     def __init__(self, file: Path, to_ecef: np.ndarray) -> None:
-        """Reads the whole map, semantic_map.pb, once."""
+        """Reads the whole map once.
+
+        Args:
+          file: semantic_map.pb.
+          to_ecef: of `world_to_ecef`.
+
+        Raises:
+          InputError: no protocol buffer, coordinates off the Earth.
+        """
         self.file = file
         self._to_world = np.linalg.inv(to_ecef)
         self._limits: dict[str, tuple[float, float]] = {}  # forward, backward
@@ -278,7 +286,12 @@ def _frame(geo: Message) -> np.ndarray:
 def world_to_ecef(file: Path, spec: dict) -> np.ndarray:
     """Reads the rigid transform [4, 4] in m of meta.json beside or above, or the TOML.
 
-    `world_to_ecef` of the TOML counts where meta.json has none.
+    Args:
+      file: semantic_map.pb.
+      spec: of the source; `world_to_ecef` counts where meta.json has none.
+
+    Raises:
+      InputError: no rigid transform.
     """
     where, found = "source TOML", spec.get("world_to_ecef")
     places = [folder / "meta.json" for folder in file.resolve().parents[:2]]
@@ -374,7 +387,7 @@ def parts(path: Path, spec: dict) -> list[Path]:
     found = _datasets(path, spec)
     if not found:
         raise InputError(
-            f"{path}: no scenes/.zarray and no folder {patterns(spec)[0]}: "
+            f"{path}: no scenes/.zarray and no folder {one_pattern(spec)}: "
             "expected L5 data"
         )
     met: dict[tuple[str, ...], Path] = {}
@@ -391,8 +404,8 @@ def parts(path: Path, spec: dict) -> list[Path]:
 
 def _datasets(path: Path, spec: dict) -> list[Path]:
     """Datasets in a folder or its scenes/."""
-    found = ({*path.glob(x), *path.glob(f"scenes/{x}")} for x in patterns(spec))
-    return sorted(set().union(*found))
+    pattern = one_pattern(spec)
+    return sorted({*path.glob(pattern), *path.glob(f"scenes/{pattern}")})
 
 
 def tables_of(folders: Sequence[Path]) -> dict[Path, np.ndarray]:
@@ -417,8 +430,11 @@ def scenes_of(folder: Path) -> np.ndarray:
 def groups_of(scenes: np.ndarray, others: Sequence[np.ndarray]) -> list[str]:
     """Groups scenes by vehicles: a host's drive without a long pause is one group.
 
-    Named by the host and the drive's start, so that it is the same in every dataset;
-    those beside it may hold earlier scenes of its drives.
+    Named by the host and the drive's start, so that it is the same in every dataset.
+
+    Args:
+      scenes: of one dataset.
+      others: of those beside it, which may hold earlier scenes of its drives.
     """
     tables = [scenes, *others]
     hosts = np.concatenate([table["host"] for table in tables])

@@ -42,7 +42,9 @@ MIN_STEP_M = 0.25  # m between points of a lane
 SEAM_M = 0.05  # m between the ends of two ways of a bound that meet
 SAME_PLACE_M = 1e-3  # m, end points that near are one
 MAX_LATITUDE = 84.0  # degrees, UTM ends there
+MAX_NODES = 5_000_000  # of all bounds; 2500 km of lanes, a point a metre
 STOP_SIGNS = ("us_r1_1", "usr1-1", "r1-1", "de206", "206", "stop")
+MAX_WAYS = 1000  # of one bound; maps have a few
 SPEED_UNITS = {
     "": 1.0 / 3.6,  # Lanelet2: no unit means km/h
     "km/h": 1.0 / 3.6,
@@ -104,16 +106,27 @@ class _Lanelet:
 def read_lanelet2(path: Path, project: Projection) -> tuple[tuple[Lane, ...], list]:
     """Reads all lanes for vehicles of a map, and notes about what was left out.
 
-    `project` is used where points are given by latitude and longitude.
+    Args:
+      path: .osm or .osm_xy file.
+      project: used where points are given by latitude and longitude.
+
+    Raises:
+      InputError: not well-formed, a point without a position, or no lane.
     """
     world = _World(path, project)
-    lanelets, broken = [], 0
+    lanelets, broken, nodes = [], 0, 0
     for name, element in world.relations.items():
         if element.tag("type") != "lanelet" or not _is_for_vehicles(element):
             continue
         directions = list(world.directions(name, element))
         lanelets += directions
         broken += not directions
+        nodes += sum(len(one.left) + len(one.right) for one in directions)
+        if nodes > MAX_NODES:
+            raise InputError(
+                f"{path}: lanelet {name[:40]}: {nodes} nodes up to it: "
+                f"expected up to {MAX_NODES}"
+            )
     if not lanelets:
         raise InputError(f"{path}: lanelet: none for vehicles: expected a road map")
     notes = [f"{broken} lanelets without two bounds left out"] if broken else []
@@ -253,6 +266,11 @@ class _World:
 
     def _bound(self, names: list[str]) -> tuple[str, ...]:
         """Nodes of a bound; its ways joined where their ends meet. () if broken."""
+        if len(names) > MAX_WAYS:
+            raise InputError(
+                f"{self.path}: bound with way {names[0][:40]}: {len(names)} ways: "
+                f"expected up to {MAX_WAYS}"
+            )
         if not names or not self.ways.keys() >= set(names):
             return ()
         joined, *parts = (self.ways[name] for name in dict.fromkeys(names))

@@ -35,8 +35,10 @@ def lanes_of_toml(
 ) -> tuple[Lane, ...]:
     """Returns the lanes that a source TOML gives: [[lanes]], or [lanes] with a file.
 
-    The file lies beside the log, or beside its folder; `metres` takes positions [n, 2]
-    of the log to m, less the recording's origin.
+    Args:
+      path: the log; a table of lanes lies beside it, or beside its folder.
+      spec: source TOML.
+      metres: positions [n, 2] of the log -> m, less the recording's origin.
     """
     given, width = spec.get("lanes", []), number(spec, "lane_width_m", LANE_WIDTH_M)
     if isinstance(given, dict):

@@ -71,7 +71,7 @@ class _User:
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """Returns XX_tracks.csv at any depth of a folder: releases keep them in data/."""
-    return files_below(path, ["*" + SUFFIX])
+    return files_below(path, "*" + SUFFIX)
 
 
 def own_name(file: Path) -> str:

@@ -368,7 +368,11 @@ class Windows:
     ) -> Recording:
         """Makes a window a part of the drive; windows come in the order of time.
 
-        `made` has `around(within)` in seconds of the drive; scenes begin `within`.
+        Args:
+          made: with `around(within)`, in seconds of the drive.
+          number: of the window.
+          within: s, when its scenes begin.
+          progress: share of the input read with it.
         """
         for track in made.tracks:
             user, first = track.id.partition("#")[0], float(track.t[0])
@@ -388,7 +392,11 @@ class Windows:
 
 
 def topics_of(spec: Mapping, known: Collection[str]) -> dict[str, list[str]]:
-    """Returns role -> names of topics of the option `topics`."""
+    """Returns role -> names of topics of the option `topics`.
+
+    Raises:
+      InputError: a role that is not known, or no list of names.
+    """
     found = {}
     for role, given in section(spec, "topics").items():
         every = [given] if isinstance(given, str) else given

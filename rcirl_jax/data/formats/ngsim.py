@@ -102,7 +102,7 @@ def parts(path: Path, spec: dict) -> list[Path]:
         and is_input(path, file)
         and "notice" not in file.name.lower()
     )
-    return sorted(found) or files_below(path, [" or ".join(wanted)])
+    return sorted(found) or files_below(path, " or ".join(wanted))
 
 
 own_name = table_stem  # of a log, as long as no other folder has one called alike

@@ -27,7 +27,7 @@ from rcirl_jax.data.formats.options import (
     UNITS,
     number,
     one_of,
-    patterns,
+    one_pattern,
     positive,
     section,
 )
@@ -52,7 +52,7 @@ SPACING_FT = 0.5  # tolerance of spacing against the positions
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """Yields one Recording of two cars per file."""
-    files = files_below(path, patterns(spec))
+    files = files_below(path, one_pattern(spec))
     groups = _groups(files)
     lengths = _leader_lengths(files, section(spec, "table"))
     for file in files:

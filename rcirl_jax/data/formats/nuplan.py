@@ -35,7 +35,7 @@ from rcirl_jax.data.formats.messages import (
     around,
     longest_window,
 )
-from rcirl_jax.data.formats.options import path_option, patterns, positive
+from rcirl_jax.data.formats.options import one_pattern, path_option, positive
 from rcirl_jax.data.formats.perception import (
     Boxes,
     ego_boxes,
@@ -83,9 +83,11 @@ CONNECTOR_BOUNDS = "gen_lane_connectors_scaled_width_polygons"
 def find_map(file: Path, names: Sequence[str], spec: Mapping) -> Path | None:
     """Finds map.gpkg of a log: MAP_FOLDERS/NAME/VERSION/ above it, or as in the TOML.
 
-    Its map may be filed under one of `names`, e.g. "us-nv-las-vegas-strip" or the
-    location "las_vegas", which names the folder that contains it. The option `maps`
-    names the folder of the maps; relative to a folder above the log.
+    Args:
+      file: the log.
+      names: under which its map may be filed, e.g. "us-nv-las-vegas-strip" or the
+        location "las_vegas", which names the folder that contains it.
+      spec: `maps` names the folder of the maps; relative to a folder above the log.
     """
     given, above = path_option(spec, "maps"), file.resolve().parents[:FOLDERS_UP]
     roots = [folder / name for folder in above for name in MAP_FOLDERS]
@@ -382,7 +384,7 @@ MAX_STAMP_GAP_S = 0.2  # s, between a lidar_pc and the pose linked to it
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """Lists the databases: each can be read without the others."""
-    return files_below(path, patterns(spec))
+    return files_below(path, one_pattern(spec))
 
 
 def own_name(file: Path) -> str:

@@ -24,7 +24,7 @@ import numpy as np
 
 from rcirl_jax.data.formats.declared import read_log, track_of
 from rcirl_jax.data.formats.files import files_below, log_name
-from rcirl_jax.data.formats.options import number, one_of, patterns
+from rcirl_jax.data.formats.options import number, one_of, one_pattern
 from rcirl_jax.data.formats.projection import utm, utm_zone
 from rcirl_jax.data.formats.shapes import local_origin
 from rcirl_jax.data.formats.tracks import spans_of, split_tracks
@@ -112,7 +112,7 @@ def _first_lines(path: Path) -> tuple[list[list[str]], list[str]]:
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """Returns the drives, without specifications, notes and tables beside them."""
-    files = files_below(path, patterns(spec))
+    files = files_below(path, one_pattern(spec))
     if path.is_dir():
         files = [file for file in files if not NOT_LOGS.fullmatch(file.name)] or files
         files = [file for file in files if _is_drive(file)] or files

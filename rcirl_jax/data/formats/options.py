@@ -16,6 +16,7 @@ LARGEST = 10**18  # of an integer
 USER_KEYS = "stated"
 MAX_NAME = 255  # bytes of a file's name
 MAX_PATH = 2048  # bytes of a path; systems take 4096, with the folder before it
+MAX_PARTS = 32  # of a pattern, which pathlib matches by recursion
 UNITS = {
     **{"m": 1.0, "ft": FOOT_M, "km": 1e3, "cm": 1e-2, "mm": 1e-3},
     **{"m/s": 1.0, "ft/s": FOOT_M, "km/h": 1.0 / 3.6, "mph": MPH_MPS},
@@ -104,8 +105,16 @@ def patterns(spec: Mapping, default: Sequence[str] = ()) -> tuple[str, ...]:
     return tuple(found)
 
 
+def one_pattern(spec: Mapping) -> str:
+    """Returns the option `pattern` of a format that has one only."""
+    found = patterns(spec)
+    if len(found) != 1:
+        raise InputError(f"source TOML: pattern: {list(found)}: expected one")
+    return found[0]
+
+
 def is_file_name(text: str) -> bool:
-    """True if it names one file in a folder."""
+    """True if it names one file in a folder, and could."""
     return text not in ("", ".", "..") and "/" not in text and _is_name(text)
 
 
@@ -118,18 +127,28 @@ def _is_pattern(item: object) -> bool:
 
     Each `**` walks all folders below those of the one before it, so it stands once.
     """
-    names = PurePosixPath(item).parts if isinstance(item, str) else ()
+    if not isinstance(item, str) or item.startswith("/"):
+        return False
+    names = PurePosixPath(item).parts
     others = [name for name in names if name != "**"]
-    is_inside = names and len(names) - len(others) < 2
-    return bool(is_inside) and all(is_file_name(n) and "**" not in n for n in others)
+    return (
+        0 < len(names) <= MAX_PARTS
+        and len(names) - len(others) <= 1
+        and all(is_file_name(name) and "**" not in name for name in others)
+    )
 
 
 def path_option(spec: Mapping, key: str) -> str:
     """Returns an option that names a file or folder; "" without one."""
     value = spec.get(key, "")
-    names = value.split("/") if isinstance(value, str) and len(value) < MAX_PATH else []
-    if not names or not all(map(_is_name, names)):
+    names = value.split("/") if isinstance(value, str) else []
+    if not names or any(name and not _is_name(name) for name in names):
         raise InputError(f"source TOML: {key}: {value}: expected a path")
+    if (size := len(value.encode(errors="replace"))) > MAX_PATH:
+        raise InputError(
+            f"source TOML: {key}: {value[:40]}...: a path of {size} bytes: "
+            f"expected at most {MAX_PATH}"
+        )
     return value
 
 

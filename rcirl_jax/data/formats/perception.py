@@ -126,8 +126,17 @@ def tracks_of(
     are left out, unless they are more than a tenth, which points at a wrong file. A box
     that is met twice at one time counts once, likewise.
 
-    Objects of unknown class become what `unknown` says: "drop", "static", "vehicle",
-    or by whether they moved ("auto").
+    Args:
+      path: named in errors.
+      boxes: at least none.
+      max_gap_s: s without a box inside one track.
+      unknown: what objects of unknown class become: "drop", "static",
+        "vehicle", or by whether they moved ("auto").
+      automated: of all tracks.
+
+    Raises:
+      InputError: a number that is not finite, an absurd size, or many times met
+        twice by one id.
     """
     if unknown not in UNKNOWN_CHOICES:
         raise InputError(

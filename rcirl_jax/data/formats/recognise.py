@@ -22,6 +22,9 @@ def recognised_format(path: Path | None, source: Path | None = None) -> str:
     Args:
       path: file or folder.
       source: TOML of columns, which makes any other table one of format csv.
+
+    Raises:
+      InputError: nothing is recognised, or files of several formats.
     """
     if path is None:
         return "synthetic"

@@ -36,6 +36,10 @@ def split_tracks(
       max_gap: see above.
       reuse: see above.
       places: [n, 2] m; where nobody gets to in time (t in s), another track starts.
+
+    Raises:
+      InputError: time goes backwards, or is met twice, inside an id, or most
+        steps are gaps.
     """
     _, codes = np.unique(ids, return_inverse=True)
     order = np.argsort(codes, kind="stable")

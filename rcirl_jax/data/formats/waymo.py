@@ -69,10 +69,12 @@ LANE_TYPES = {0: "undefined", 1: "freeway", 2: "surface_street", 3: "bike_lane"}
 DRIVEN = ("undefined", "freeway", "surface_street")
 MAX_HALF_WIDTH_M = 5.0  # m; a farther line does not bound the lane
 MEASURE_STEP = 4  # points (2 m) between those at which widths are measured
+MAX_POINTS = 5_000_000  # of all lanes; 10,000 km of them are no map
 # LANE_STATE_*: unknown, arrow stop/caution/go, stop/caution/go, flashing stop/caution
 OFF, RED, YELLOW, GREEN = range(len(STATES))
 COLOURS = np.array([OFF, RED, YELLOW, GREEN, RED, YELLOW, GREEN, OFF, OFF], np.int8)
 FLASHING_STOP = 7  # a stop sign, in effect
+MAX_COLOURS = 50_000_000  # lanes by steps; 1000 lanes over an hour take 36 million
 
 
 def read_map(
@@ -80,7 +82,12 @@ def read_map(
 ) -> tuple[tuple[Lane, ...], tuple[Signal, ...], list[str]]:
     """Reads lanes, signals and notes of one scenario.
 
-    `t` [T] s are the steps; `origin` [2] m is subtracted from all points.
+    Args:
+      where: names file and record in errors.
+      scenario: the message.
+      t: [T] s, times of the steps.
+      origin: [2] m, subtracted from all points.
+      spec: source TOML.
     """
     features = scenario.map_features
     steps = scenario.dynamic_map_states
@@ -161,7 +168,7 @@ def _lanes(
     bounds = _polylines(where, lines, origin)
     order, default = list(heads.values()), 0.5 * number(spec, "lane_width_m")
     line_of = [centres[key] for key in heads]
-    widths = [_half_widths(side, order, line_of, bounds) for side in SIDES]
+    widths = [_half_widths(where, side, order, line_of, bounds) for side in SIDES]
     beside = [_neighbours(order, side) for side in SIDES]
     exits = {key: dict.fromkeys(head.exit_lanes) for key, head in heads.items()}
     for key, head in heads.items():
@@ -204,6 +211,7 @@ def _lanes(
 
 
 def _half_widths(
+    where: str,
     side: str,
     heads: Sequence[Message],
     lanes: Sequence[np.ndarray],
@@ -213,7 +221,14 @@ def _half_widths(
 
     A lane names the road lines and edges beside it, each for a range of its points.
     Measured at every fourth point, interpolated between, held beyond; None of lanes
-    without a known bound. `lines`: feature id -> points [m >= 1, 2] m.
+    without a known bound.
+
+    Args:
+      where: names file and record in errors.
+      side: left or right.
+      heads: of the lanes.
+      lanes: points [n, 2] m of each lane.
+      lines: feature id -> points [m >= 1, 2] m.
     """
     if not heads:
         return []
@@ -222,6 +237,11 @@ def _half_widths(
     sizes = np.array([len(points) for points in lanes], np.int64)
     longest = int(sizes.max())
     first, last = np.clip(first, 0, longest), np.clip(last, -1, longest)
+    total = int(np.maximum(last - first + 1, 0).sum())
+    if total > MAX_POINTS:
+        raise InputError(
+            f"{where}: {side}_boundaries: {total} points: expected at most {MAX_POINTS}"
+        )
     begins = np.cumsum(sizes) - sizes
     half = np.full(int(sizes.sum()), np.nan)
     last = np.minimum(last, sizes[lane] - 1)
@@ -289,6 +309,11 @@ def _signals(
             f"expected 0 to {len(COLOURS) - 1}"
         )
     ids, rows = np.unique(lane, return_inverse=True)
+    if ids.size * t.size > MAX_COLOURS:
+        raise InputError(
+            f"{where}: dynamic_map_states: {ids.size} lanes over {t.size} steps: "
+            f"expected at most {MAX_COLOURS} states"
+        )
     colours = np.full((ids.size, t.size), OFF, np.int8)
     counts = [len(step.lane_states) for step in steps]
     step = np.repeat(np.arange(len(steps)), counts)

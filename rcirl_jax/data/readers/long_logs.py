@@ -116,11 +116,16 @@ def rows_of(
     is_clock: bool = False,
     **tidying: Any,  # noqa: ANN401
 ) -> Iterator["RowStore"]:
-    """Gives the rows of a table, at least t [s] and id, each user once in a frame.
+    """Gives the rows of a table, each road user once in a frame.
 
-    Those of a long table go to scratch files, which are removed afterwards; a bar shows
-    the reading. With `is_clock` t is a time of day, which may go over midnight.
-    `tidying` are places, may_differ and distance of `RowStore`.
+    Args:
+      table: of `open_table`.
+      fields: what is read, at least t [s] and id.
+      stats: of the file.
+      is_long: the rows go to scratch files, which are removed afterwards; a bar
+        shows the reading.
+      is_clock: t is a time of day, which may go over midnight.
+      **tidying: places, may_differ, distance of `RowStore`.
     """
     with scratch() if is_long else contextlib.nullcontext() as folder:
         made = RowStore(stats=stats, folder=folder, **tidying)
@@ -328,7 +333,9 @@ class RowStore:
     def slices(self, recording: str | None, max_gap_s: float) -> Iterator[TimeSlice]:
         """Yields every minute with its surroundings, in the order of time.
 
-        A road user unseen for longer than `max_gap_s` is another fragment.
+        Args:
+          recording: one of `recordings()`.
+          max_gap_s: a road user unseen for longer is another fragment.
         """
         if self.folder is None:
             for values in self.minutes(recording):

@@ -75,7 +75,11 @@ class Database:
         return InputError(f"{self.path}: {field}: {found[:120]}: expected {expected}")
 
     def columns(self, table: str) -> tuple[str, ...]:
-        """Returns the names of a table's columns; none if there is no such table."""
+        """Returns the names of a table's columns; none if there is no such table.
+
+        Raises:
+          InputError: it is a view or a virtual table, or the schema is broken.
+        """
         kinds = "SELECT type, sql FROM sqlite_master WHERE name = ?"
         kinds += " AND type IN ('table', 'view')"
         for rows in self.chunks(kinds, (table,), values=(table,)):

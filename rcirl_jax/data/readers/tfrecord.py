@@ -21,7 +21,11 @@ GZIP_MAGIC = b"\x1f\x8b"
 
 
 def read_records(path: Path, limit: int = MAX_RECORD_BYTES) -> Iterator[bytes]:
-    """Yields the data of each record, of `limit` bytes at most, uncompressed."""
+    """Yields the data of each record, of `limit` bytes at most, uncompressed.
+
+    Raises:
+      InputError: damaged, truncated, compressed or empty file; a longer record.
+    """
     crc32c = extra_module("google_crc32c").value
 
     def check(where: str, field: str, content: bytes, stored: int) -> None:

@@ -13,7 +13,12 @@ from rcirl_jax.errors import InputError
 
 
 def read_xml(path: Path, tag: str, max_bytes: int) -> Element:
-    """Reads the root element, which has to be called `tag`."""
+    """Reads the root element, which has to be called `tag`.
+
+    Raises:
+      InputError: too large a file, a DTD, entities or external references, XML
+        that is not well formed, or another root.
+    """
     from defusedxml import DefusedXmlException
     from defusedxml import ElementTree as Safe
 

@@ -56,7 +56,12 @@ class StructuredArray:
     """A folder with a .zarray and chunks "0", "1", ... of records."""
 
     def __init__(self, folder: Path, fields: Mapping[str, tuple[str, tuple]]) -> None:
-        """Reads the metadata; fields needed: name -> (numpy kinds, shape)."""
+        """Reads and checks the metadata only.
+
+        Args:
+          folder: of the array.
+          fields: name -> (numpy kinds allowed, shape) of the fields needed.
+        """
         self.path = folder
         file = folder / ".zarray"
         body = read_json(file, "the metadata of an array", MAX_METADATA_BYTES)

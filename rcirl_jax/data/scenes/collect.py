@@ -277,8 +277,15 @@ class Collector:
     ) -> tuple[int, dict[str, np.ndarray]]:
         """Returns the number of road users in view, and the most relevant as boxes.
 
-        By the samples [samples, 4] of `_view`, of tracks with the numbers `others` and
-        times [T] s: fields of OBSTACLES, [k] or [k, T] each, k <= room.
+        Args:
+          row: the scene.
+          view: [samples, 4] of `_view`.
+          others: numbers of tracks at the time.
+          clock: [T] s.
+          room: boxes at most.
+
+        Returns:
+          (number, fields of OBSTACLES, [k] or [k, T] each, k <= room).
         """
         frames = clock * self.rate - self._first[others, None]  # [n, T]
         last = (self._last - self._first)[others, None]
@@ -377,10 +384,16 @@ _complete = jax.jit(jax.vmap(trajectory_from_positions))
 def assemble(
     rows: list[dict], *, vehicles: list[int], groups: list[int], recording: int
 ) -> Demonstration:
-    """Return one batched Demonstration of a recording's n >= 1 rows, numpy [n, ...].
+    """Return one batched Demonstration of a recording's rows.
 
-    The dataset's numbers are given: of each row's vehicle and vehicle-disjoint group,
-    and of the recording.
+    Args:
+      rows: at least one row as made by `collect.Collector`.
+      vehicles: number of the ego's vehicle inside the dataset, per row.
+      groups: number of the vehicle-disjoint group, per row.
+      recording: number of the recording inside the dataset.
+
+    Returns:
+      Demonstration with numpy leaves [n, ...].
     """
     scene, count = stack_scenes(rows), len(rows)
 

@@ -256,7 +256,9 @@ class LaneGraph:
     def _beyond(self, lane: Lane, sense: int) -> np.ndarray:
         """Returns points [k, 2] m along the lane beside one that ends or begins.
 
-        `sense` 1: beyond the end of a chain's last lane, -1: before its first one.
+        Args:
+          lane: the last of a chain, or the first.
+          sense: 1: beyond its end, -1: before its start.
         """
         follows = lane.successors if sense > 0 else self.predecessors[lane.id]
         found = np.zeros((0, 2))

@@ -249,7 +249,11 @@ def folds_by_recording(dataset: Demonstrations, count: int) -> list[Resplit]:
 
 
 def with_tags(dataset: Demonstrations, names: Sequence[str]) -> Demonstrations:
-    """Keeps the scenes with one of these tags of `Tag`, in small letters; none: all.
+    """Keeps the scenes with one of these tags; all of them without a name.
+
+    Args:
+      dataset: any dataset with splits "train" and "test".
+      names: of `Tag`, in small letters.
 
     Raises:
       InputError: an unknown tag, or a split in which no scene has one.

@@ -152,7 +152,11 @@ class LogColumns:
 
 
 def columns_of(table: Table, spec: Mapping) -> LogColumns:
-    """Returns the columns of a table by its source TOML."""
+    """Returns the columns of a table by its source TOML.
+
+    Raises:
+      InputError: an unknown field or unit, a needed column that is missing.
+    """
     rate = positive({**spec, **section(spec, "defaults")}, "rate_hz", RATE_HZ)
     columns, units, notes = _named(table, spec)
     _check_units(table, spec, units)
@@ -278,6 +282,10 @@ def clock_digits(cells: Sequence[str], values: np.ndarray) -> tuple[str, bool]:
 
     It is sure of texts with a leading zero, such as 080459920, and where a minute's
     last row and the next one's first are one step apart as digits only.
+
+    Args:
+      cells: of the first rows, not empty.
+      values: [n] of these or more rows, as numbers.
     """
     whole = [re.fullmatch(r"(\d+)([.,]\d*)?", cell) for cell in cells]
     if not cells or not values.size or not all(whole):
@@ -524,8 +532,12 @@ def meaning_of(
 ) -> Meaning:
     """Returns the meaning of a file.
 
-    No more rows (x and y in metres) are taken than are needed; `automated` is all that
-    the column of this field holds.
+    Args:
+      path: named in errors.
+      rows: in portions, x and y in metres; no more are taken than are needed.
+      automated: all that the column of this field holds.
+      columns: of the file.
+      spec: source TOML.
     """
     flags = flags_of(path, automated, spec)
     names, rate = {field.name for field in columns.fields}, columns.rate_hz
@@ -580,8 +592,14 @@ def heading_form(
 ) -> HeadingForm:
     """Returns the form of a file's headings by the first rows in which enough move.
 
-    Where they are too few, it is as declared, or as usual. Rows have id, t [s], x, y
-    [m], heading as in the file; the unit is rad, deg, or "": whichever fits.
+    Where they are too few, it is as declared, or as usual.
+
+    Args:
+      path: named in errors.
+      rows: id, t [s], x, y [m], heading as in the file, [n] each, in portions.
+      unit: rad or deg; "": whichever fits.
+      spec: source TOML.
+      rate_hz: rows per second of a road user.
     """
     said = one_of(spec, CONVENTION, CONVENTIONS) if spec.get(CONVENTION) else ""
     headings = None

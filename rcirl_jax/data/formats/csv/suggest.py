@@ -135,7 +135,11 @@ class _Guess:
 
 
 def suggested(path: Path) -> Suggestion:
-    """Returns a source TOML by the head of a table."""
+    """Returns a source TOML by the head of a table.
+
+    Raises:
+      InputError: no table, or one whose first rows nobody can read.
+    """
     with as_input_error(str(path), "a table with a row per road user and time"):
         table = open_table(path, known=foreign_words())
         guess = _guess_columns(table)

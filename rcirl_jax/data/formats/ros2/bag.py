@@ -77,7 +77,11 @@ def bags_of(path: Path, spec: dict) -> list[Path]:
 
 
 def files_in(bag: Path) -> list[Path]:
-    """Lists the files of a bag, in the order of time."""
+    """Lists the files of a bag, in the order of time.
+
+    Raises:
+      InputError: packed as a whole by rosbag2, no files, or one that is missing.
+    """
     files, metadata = [bag], bag / METADATA
     if metadata.is_file():
         where = f"{metadata}: relative_file_paths"
@@ -248,7 +252,11 @@ def as_sent(data: bytes) -> bytes:
 
 
 def decoder_of(path: Path, name: str, topic: Topic) -> Callable[[bytes], Message]:
-    """Makes what decodes a topic's messages, by the definition that the file holds."""
+    """Makes what decodes a topic's messages, by the definition that the file holds.
+
+    Raises:
+      InputError: an encoding that is not ROS 2's, or no definition.
+    """
     where, wrong = f"{path}: {name} ({topic.type})", ""
     if topic.encoding != "cdr":
         wrong = (

@@ -195,7 +195,9 @@ def _obstacle(
 def _autoware(pose: str, twist: str) -> Reader:
     """TrackedObjects and PredictedObjects of Autoware; paths are not read.
 
-    `pose` leads from an object's kinematics to its pose, `twist` to its own velocity.
+    Args:
+      pose: leads from an object's kinematics to its pose.
+      twist: to its velocity in its own frame.
     """
     pose_of, twist_of = attrgetter(pose), attrgetter(twist)
 

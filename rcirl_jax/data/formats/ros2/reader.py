@@ -138,7 +138,12 @@ def signals_of(
 def with_stop_lines(
     lanes: Sequence[Lane], places: Mapping[str, np.ndarray]
 ) -> tuple[tuple[Lane, ...], list[str]]:
-    """Stops the lanes nearest to a light's places [n, 2] m by it, with notes."""
+    """Stops the lanes nearest to a light's places by it, with notes.
+
+    Args:
+      lanes: of one recording.
+      places: group -> [n, 2] m in the recording's frame.
+    """
     changed, notes = list(lanes), []
     for name, points in places.items():
         for point in points:

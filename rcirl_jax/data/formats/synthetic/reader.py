@@ -61,9 +61,14 @@ class _Entry(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """Yields all recordings that a TOML declares, checked before the first is made.
+    """Yields all recordings that a TOML file declares.
 
-    What it does not set is taken from `spec`, the packaged settings.
+    Args:
+      path: the file, like data_specs/sources/synthetic.toml.
+      spec: the packaged settings; what `path` does not set is taken from there.
+
+    Raises:
+      InputError: an unknown key or a bad value, before anything is simulated.
     """
     own = load_toml(path)
     # what an import adds says nothing here: none of these is refused

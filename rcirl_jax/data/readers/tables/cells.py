@@ -43,7 +43,10 @@ def is_texts(column: Any) -> bool:  # noqa: ANN401
 def numbers(column: Any, decimal: str, thousands: str) -> Found:  # noqa: ANN401
     """Returns a column of numbers [n] float64, NaN where a cell is empty.
 
-    Numbers written as text have a decimal mark, and perhaps one between thousands.
+    Args:
+      column: pyarrow's array.
+      decimal: mark of numbers written as text.
+      thousands: mark between their groups of three digits; "": none.
 
     Raises:
       ArrowException: a column of Parquet's that holds no numbers.
@@ -127,7 +130,9 @@ def times_of_day(digits: np.ndarray, form: str) -> Found:
 def times(column: Any, form: str) -> Found:  # noqa: ANN401
     """Returns times [n] s since 1970 (UTC where no zone is said), NaN where empty.
 
-    Of texts, digits, or Parquet's own types; by `ISO`, or a pattern of strptime.
+    Args:
+      column: texts, digits, or times of Parquet's own types.
+      form: `ISO`, or a pattern of Python's strptime.
     """
     arrow, compute = extra_module("pyarrow"), extra_module("pyarrow.compute")
     if not is_texts(column) and not arrow.types.is_integer(column.type):

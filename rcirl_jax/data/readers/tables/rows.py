@@ -134,6 +134,9 @@ def drop_duplicates(
       places: names of the positions; one that is not there is 0.
       may_differ: columns in which rows that repeat each other may differ.
       name_of: an id as the file has it.
+
+    Raises:
+      InputError: more rows than are allowed.
     """
     clock = rows[t]
     ids = np.zeros(clock.size) if user is None else rows[user]
@@ -202,8 +205,13 @@ def drop_position_outliers(
 
     A cell of 9999 among others is such a place: up to `SPIKE_ROWS` rows that nobody
     reaches from the rows before, or leaves to those after. They count as unreadable.
-    Those amid a track go first: a row behind one may then be near the others. Rows have
-    t [s], id, x, y and `line`; `distance` is that of differences in x and y.
+    Those amid a track go first: a row behind one may then be near the others.
+
+    Args:
+      rows: columns [n] that were read: t [s], id, x, y and `line`.
+      stats: of the file.
+      distance: of differences in x and y.
+      name_of: an id as the file has it.
     """
     codes = np.unique(rows["id"], return_inverse=True)[1]
     order = np.lexsort((rows["t"], codes))

@@ -69,7 +69,11 @@ def packing(path: Path) -> str | None:
 
 @contextlib.contextmanager
 def unpacked(path: Path) -> Iterator[tuple[Any, IO[bytes]]]:
-    """Opens a file, perhaps packed: (stream of the bytes inside, the file itself)."""
+    """Opens a file that may be packed: (stream of the bytes inside, the file itself).
+
+    Raises:
+      InputError: a damaged archive, a Git LFS pointer, a spreadsheet.
+    """
     refuse_pointer(path)
     head, packed = first_bytes(path), packing(path)
     for mark, what in NO_TABLES.items():
@@ -125,7 +129,10 @@ def head_of(
 ) -> tuple[str, bool, list[str]]:
     """Returns the encoding of a text, whether it is a guess, and its first lines.
 
-    Without a given encoding names that the text should hold tell several apart.
+    Args:
+      path: file.
+      encoding: of its characters; "": recognised.
+      known: names of which the text should hold some; they tell encodings apart.
     """
     is_guess = False
     if not encoding:
@@ -185,8 +192,11 @@ def blocks(
 ) -> Iterator[tuple[int, str]]:
     """Yields (number of its first line, whole rows) of a text, a few MiB at a time.
 
-    Inside of quotes a row may go on in the next line. `show` is called with the bytes
-    of the file just read.
+    Args:
+      path: file.
+      encoding: of its characters.
+      quote: inside of which a row may go on in the next line; "": nowhere.
+      show: called with the bytes of the file just read.
     """
     number, at = 1, 0
     with _text(path, encoding) as (text, file):

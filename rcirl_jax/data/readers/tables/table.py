@@ -106,7 +106,11 @@ class Table:
         return bool(self._found(column))
 
     def place(self, column: str) -> int:
-        """Returns the number of a column."""
+        """Returns the number of a column.
+
+        Raises:
+          InputError: it is missing, or met twice.
+        """
         found = self._found(column)
         if len(found) == 1:
             return found[0]
@@ -147,8 +151,10 @@ def open_table(
 ) -> Table:
     """Opens a table of any of the forms, its layout recognised.
 
-    `options`, [table] of the source TOML, win; `known` names that the table should hold
-    may tell its encoding.
+    Args:
+      path: file.
+      options: [table] of the source TOML, which wins over what is recognised.
+      known: names that the table should hold, which may tell its encoding.
     """
     if is_columnar(path):
         return Table(path=path, header=tuple(columns_of(path)))
@@ -201,8 +207,11 @@ def batches(
 ) -> Iterator[Batch]:
     """Yields the readable rows of a few MiB in SI units.
 
-    Of fields with `user`, the rows of all users come below each other. `show` is called
-    with the bytes of the file just read.
+    Args:
+      table: of `open_table`.
+      fields: what is read; with `user`, the rows of all users come below each other.
+      stats: counts what is dropped.
+      show: called with the bytes of the file just read.
     """
     places = [table.place(field.column) for field in fields]
     if table.layout is not None:
@@ -390,7 +399,11 @@ def read(table: Table, fields: Sequence[Field], stats: RowStats) -> Rows:
 
 
 def as_texts(table: Table, batch: Batch) -> Rows:
-    """Returns a batch with its texts themselves."""
+    """Returns a batch with its texts themselves.
+
+    Raises:
+      InputError: one text is so long that all of them would fill the memory.
+    """
     made = dict(batch)
     for name, column in batch.items():
         if isinstance(column, tuple):

@@ -109,8 +109,13 @@ def recognise(
 ) -> tuple[Layout, list[list[str]]]:
     """Returns the layout of a table, and the cells of its first rows.
 
-    Options of `section`, [table] of the source TOML, win; `known` names that the text
-    should hold may tell its encoding.
+    Args:
+      path: file.
+      section: [table] of the source TOML, whose options win.
+      known: names that the text should hold, which may tell its encoding.
+
+    Raises:
+      InputError: no text, an unknown option, more columns than tables have.
     """
     given = _options(path, section)
     encoding, is_guess, lines = head_of(path, given.get("encoding", ""), known)
@@ -323,7 +328,17 @@ def text_batches(
     places: Sequence[int],
     show: Callable[[int], object] | None = None,
 ) -> Iterator[TextBatch]:
-    """Yields columns of a table by their numbers, a few MiB at a time."""
+    """Yields columns of a table, a few MiB at a time.
+
+    Args:
+      path: file.
+      layout: of its text.
+      places: numbers of the columns.
+      show: called with the bytes of the file just read.
+
+    Raises:
+      InputError: the last line breaks off, or a line has no end.
+    """
     for start, whole in blocks(path, layout.encoding, layout.quote, show):
         above = max(layout.skip - start + 1, 0)  # lines above the first row
         text = whole
