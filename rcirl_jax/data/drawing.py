@@ -27,7 +27,11 @@ class Drawing(str):
 
 
 def site_svg(plan: Mapping[str, Any]) -> Drawing:
-    """Draws a recording's plan, of `plans.plan_of`, its longer side across."""
+    """Draws the plan of a recording, its longer side across.
+
+    Args:
+      plan: of `data.plans.plan_of`.
+    """
     drawn = io.StringIO()
     with mpl.rc_context({"svg.hashsalt": "site"}):  # ids are the same each time
         draw_site(plan).savefig(drawn, format="svg", dpi=110, metadata={"Date": None})

@@ -318,8 +318,11 @@ def scenes_in(
 class Progress:
     """A bar of the share read: scenes, scenes/s, drop reasons, time left.
 
-    All `total` files count alike (None: recordings are counted). Inside one the bar
-    moves as its recordings say how much of it is read.
+    All input files count alike. Inside one the bar moves as its recordings say how
+    much of it is read.
+
+    Args:
+      total: files; None: unknown, recordings are counted then.
     """
 
     FORMAT = "{desc}: {percentage:.0f}% [{elapsed}<{remaining}{postfix}]"

@@ -192,9 +192,12 @@ class QualityReport:
 
 
 def merged_notes(notes: Sequence[tuple[str, str]]) -> list[str]:
-    """Returns notes (recording, note) as lines; equal ones are one line.
+    """Returns notes as lines: equal ones of several recordings as one.
 
     What stands first among the notes of a recording comes first.
+
+    Args:
+      notes: (name of the recording, note), in the order of the recordings.
     """
     ranks: dict[str, int] = {}
     met: Counter = Counter()

@@ -72,8 +72,15 @@ def accepted(
 ) -> Recording:
     """Return a validated recording of several in one file.
 
-    With `leave_out` what is refused becomes a recording without tracks that says why,
-    and the next one can be read.
+    Args:
+      make: reads it.
+      name: of the recording, where it cannot be read.
+      file: named in errors.
+      spec: of the source; with `leave_out` what is refused becomes a recording
+        without tracks that says why, and the next one can be read.
+
+    Raises:
+      InputError: as `validate_recording`, without `leave_out`.
     """
     try:
         with as_input_error(str(file), "a sound recording"):
@@ -206,7 +213,11 @@ def _check_track(where: str, track: Track) -> None:
 
 
 def check_span(where: str, field: str, values: np.ndarray) -> None:
-    """No place [m] is absurdly far from the others, as one wrong cell would be."""
+    """No place [m] is absurdly far from the others, as one wrong cell would be.
+
+    Raises:
+      InputError: naming the value farthest from the median.
+    """
     if not values.size or np.ptp(values) <= MAX_SPAN_M:
         return
     middle = float(np.median(values))

@@ -761,7 +761,11 @@ class Roads:
         return float(np.mean(_on(ridges, samples, width)[0] >= 0))
 
     def moved(self, by: np.ndarray) -> "Roads":
-        """Returns the same in another frame, `by` [2] m added to every place."""
+        """Returns the same in another frame.
+
+        Args:
+          by: [2] m, added to every place.
+        """
         lanes = [dataclasses.replace(x, centre=x.centre + by) for x in self.lanes]
         return dataclasses.replace(self, lanes=tuple(lanes))
 
@@ -784,7 +788,14 @@ def roads_of_sites(
     """Estimates lanes from all files of one site together, in one frame.
 
     Files are of one site if the lanes of the one with most driving explain the others.
-    Arguments are those of `roads_from_tracks`; the result has the roads of each file.
+
+    Args:
+      files: the tracks of each.
+      width: m, as of `roads_from_tracks`.
+      limit: m/s, likewise.
+
+    Returns:
+      The roads of each file's site.
     """
     options = {"width": width, "limit": limit}
     order = sorted(range(len(files)), key=lambda n: -sum(x.t.size for x in files[n]))

@@ -46,7 +46,13 @@ def over_packaged(spec: dict, packaged: Mapping, free: Collection[str]) -> dict:
 def open_log(
     path: Path, spec: Mapping, known: Collection[str] = ()
 ) -> tuple[Table, RowStats]:
-    """Opens a table, which should hold `known` names; counts of its rows."""
+    """Opens a table as its source TOML says, and counts of its rows.
+
+    Args:
+      path: file.
+      spec: source TOML.
+      known: names that the table should hold, which may tell its encoding.
+    """
     table = open_table(path, section(spec, "table"), known)
     return table, RowStats(path=path, unit=table.unit, allowed=allowed_share(spec))
 
@@ -70,7 +76,9 @@ def read_log(
 def size_of(rows: Rows, usual: Sequence[float]) -> tuple[float, float, bool]:
     """Returns medians [m] of the known lengths and widths, and whether one is assumed.
 
-    NaN, and 0, is unknown; `usual` is taken where no row says them.
+    Args:
+      rows: perhaps length and width [n] m; NaN, and 0, is unknown.
+      usual: m, length and width where no row says them.
     """
     known = [rows.get(field, np.zeros(0)) for field in ("length", "width")]
     known = [sizes[sizes > 0.0] for sizes in known]  # NaN is not

@@ -104,11 +104,14 @@ class _Lanelet:
 
 
 def read_lanelet2(path: Path, project: Projection) -> tuple[tuple[Lane, ...], list]:
-    """Reads all lanes for vehicles of a map, and notes about what was left out.
+    """Reads all lanes for vehicles of a map.
 
     Args:
       path: .osm or .osm_xy file.
       project: used where points are given by latitude and longitude.
+
+    Returns:
+      The lanes, and notes about what was left out.
 
     Raises:
       InputError: not well-formed, a point without a position, or no lane.

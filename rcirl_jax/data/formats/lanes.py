@@ -163,7 +163,11 @@ def parallel_lane(
 ) -> Lane:
     """Returns a lane parallel to the x axis, driven the way that it is.
 
-    `sides` m: from the centre line to the bounds; `beside`: ids of the lanes there.
+    Args:
+      lane: where it lies.
+      sides: m, from the centre line to the left and right bound.
+      beside: ids of the lanes to the left and to the right.
+      limit: m/s, or None.
     """
     steps = int((lane.upper - lane.lower) / LANE_STEP_M)
     x = np.linspace(lane.lower, lane.upper, steps + 2)

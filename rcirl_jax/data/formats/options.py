@@ -153,9 +153,13 @@ def path_option(spec: Mapping, key: str) -> str:
 
 
 def check_options(spec: Mapping, packaged: Mapping, form: Format) -> None:
-    """Refuses the first option that is unknown or of another type than the format's.
+    """Checks that options are known, and have the types of those that the format has.
 
     In a table whose values are all of one type any value is of that type.
+
+    Raises:
+      InputError: the first one that is not known (with the nearest that is), or has
+        another type.
     """
     known = {**packaged, **form.options}
     check_names("source TOML: ", spec, [*known])

@@ -63,10 +63,16 @@ def ego_boxes(
     heading: np.ndarray,
     speed: np.ndarray,
 ) -> Boxes:
-    """Makes boxes of the recording car, id "ego", from its poses [n], in SI units.
+    """Makes boxes of the recording car, id "ego", from its poses.
 
-    The table `ego` of the TOML has its length and width, and how far ahead of a pose's
-    place the box's centre lies. A speed of NaN is that of the positions.
+    Args:
+      spec: source TOML; the table `ego` has the car's measures in m: length, width,
+        and how far ahead of a pose's place the box's centre lies.
+      t: [n] s.
+      x: [n] m.
+      y: [n] m.
+      heading: [n] rad.
+      speed: [n] m/s; NaN: from the positions.
     """
     own = section(spec, "ego")
     ahead_of = "centre_ahead" if "centre_ahead" in own else "rear_axle_to_centre"
@@ -237,7 +243,11 @@ def _is_possible(track: Track) -> bool:
 def placed(
     tracks: Sequence[Track],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Track]]:
-    """Returns x, y [n] m as they were, a local origin [2] m, tracks around it."""
+    """Moves tracks to a local origin.
+
+    Returns:
+      x, y [n] m of all samples as they were, the origin [2] m, the tracks around it.
+    """
     x = np.concatenate([track.x for track in tracks])
     y = np.concatenate([track.y for track in tracks])
     origin = local_origin(x, y)
@@ -263,9 +273,13 @@ def fitted_lanes(
 def held_states(
     clock: np.ndarray, seen: np.ndarray, states: np.ndarray, hold: float
 ) -> np.ndarray:
-    """Returns [T] numbers of STATES: the last state [n] seen of a light.
+    """Holds the last state seen of a light: [T] numbers of STATES.
 
-    All times are in one unit; the light is off after `hold` without any.
+    Args:
+      clock: [T] times, increasing.
+      seen: [n] times, increasing, in the same unit.
+      states: [n] numbers of STATES.
+      hold: in the same unit; the light is off after it without any.
     """
     last = np.searchsorted(seen, clock, side="right") - 1
     fresh = (last >= 0) & (clock - seen[np.maximum(last, 0)] <= hold)

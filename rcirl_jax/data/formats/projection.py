@@ -15,7 +15,14 @@ def utm_zone(longitude: float) -> int:
 def utm(
     latitude: np.ndarray, longitude: np.ndarray, zone: int, *, south: bool = False
 ) -> np.ndarray:
-    """Returns easting and northing [n, 2] m in a zone of positions [n] in degrees."""
+    """Returns easting and northing [n, 2] m of positions in degrees.
+
+    Args:
+      latitude: [n] degrees north.
+      longitude: [n] degrees east.
+      zone: UTM zone whose central meridian is used, also beyond its borders.
+      south: add the false northing of the southern hemisphere.
+    """
     system = f"+proj=utm +zone={zone} {'+south ' if south else ''}+ellps=WGS84"
     project = extra_module("pyproj").Transformer.from_pipeline(system).transform
     places = np.stack(project(longitude, latitude), axis=1)

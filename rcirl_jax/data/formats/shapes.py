@@ -41,7 +41,14 @@ def origin_notes(origin: np.ndarray) -> list[str]:
 def check_coordinates(
     path: Path | str, where: str, fields: Sequence[str], values: np.ndarray
 ) -> None:
-    """Checks that coordinates [n, len(fields)] m are finite and on Earth."""
+    """Checks that every coordinate is finite and on Earth.
+
+    Args:
+      path: file, named in errors.
+      where: what the coordinates belong to.
+      fields: names of the columns of `values`.
+      values: [n, len(fields)] m.
+    """
     # NaN compares false
     bad = np.argwhere(~(np.abs(values) <= MAX_COORDINATE_M))
     if bad.size:
@@ -91,7 +98,13 @@ def lane_between(
     bounds: tuple[np.ndarray, np.ndarray],
     **known: Any,  # noqa: ANN401
 ) -> Lane:
-    """Makes a lane midway between a left and a right bound [m, 2] m, point by point."""
+    """Makes a lane midway between two bounds whose points face each other.
+
+    Args:
+      name: its id.
+      bounds: [m, 2] m, left and right, in driving direction.
+      known: other fields of the lane.
+    """
     left, right = bounds
     half = np.maximum(0.5 * np.hypot(*(left - right).T), MIN_HALF_WIDTH_M)
     centre = 0.5 * (left + right)

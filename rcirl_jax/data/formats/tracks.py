@@ -23,19 +23,22 @@ def split_tracks(
     reuse: float = np.inf,
     places: np.ndarray | None = None,
 ) -> list[tuple[str, np.ndarray]]:
-    """Returns (name, row numbers in the order of time) of each track without a gap.
+    """Returns the rows of each track: one road user without a gap.
 
-    A gap longer than `max_gap` starts another track of the same id, named "id#2",
-    "id#3", ... A step back by more than `reuse` is a number given to somebody else at
-    another time; by less it is an error.
+    A gap longer than `max_gap` starts another track of the same id, named
+    "id#2", "id#3", ... A step back by more than `reuse` is a number given to
+    somebody else at another time; by less it is an error.
 
     Args:
       path: named in errors.
       ids: [n] of each row, text or numbers.
-      t: [n] in any unit, that of max_gap and reuse.
-      max_gap: see above.
-      reuse: see above.
+      t: [n] in any unit.
+      max_gap: in the unit of t.
+      reuse: in the unit of t.
       places: [n, 2] m; where nobody gets to in time (t in s), another track starts.
+
+    Returns:
+      (name, row numbers in the order of time) per track.
 
     Raises:
       InputError: time goes backwards, or is met twice, inside an id, or most

@@ -126,6 +126,10 @@ def rows_of(
         shows the reading.
       is_clock: t is a time of day, which may go over midnight.
       **tidying: places, may_differ, distance of `RowStore`.
+
+    Raises:
+      InputError: no rows, more bad ones than are allowed, or more than MAX_BLOCKS
+        minutes.
     """
     with scratch() if is_long else contextlib.nullcontext() as folder:
         made = RowStore(stats=stats, folder=folder, **tidying)

@@ -69,7 +69,12 @@ class Node:
         return (self.element.findtext(tag) or "").strip()
 
     def number(self, tag: str, default: float | None = None) -> float:
-        """Reads a finite number from a child; without a default it has to be there."""
+        """Reads a finite number from the text of a child.
+
+        Args:
+          tag: of the child.
+          default: where there is none; None: it has to be there.
+        """
         found = self.element.find(tag)
         if found is None and default is not None:
             return default

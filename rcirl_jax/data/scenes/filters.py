@@ -126,12 +126,20 @@ def reject(row: dict, config: CollectConfig, missing: np.ndarray) -> str | None:
 
 
 def surroundings_end(row: dict, ends: np.ndarray) -> float:
-    """Returns when [s] the first road user that the human reacts to leaves the record.
+    """Returns when the first road user that the human reacts to leaves the record.
 
-    At the end of its track (`ends` [N] s after the frame) it matters if it is the
-    nearest one ahead on the human's own path, or one beside it that the human is about
-    to pass (`labels`: nudge). Road users that were passed, left the path or are hidden
-    by a nearer one do not count, nor does a track that another one continues.
+    At the end of its track it matters if it is the nearest one ahead on the human's
+    own path, or one beside it that the human is about to pass (`labels`: nudge).
+    Road users that were passed, left the path or are hidden by a nearer one do not
+    count, nor does a track that another one continues in the same place.
+
+    Args:
+      row: the scene's flat arrays, without labels.
+      ends: [N] s after the planning frame, end of the track in each slot; inf where
+        there is none.
+
+    Returns:
+      Seconds after the planning frame; inf if the surroundings outlast the human.
     """
     for slot in np.argsort(ends, kind="stable").tolist():
         end = float(ends[slot])

@@ -185,7 +185,15 @@ def check_events(recorded: Iterable[LineEvents]) -> list[PhaseCheck]:
 def check_written(
     parts: Sequence[InputFile], *, executor: Executor | None = None
 ) -> list[PhaseCheck]:
-    """Checks the recorded signals against all drivers of the logs, line by line."""
+    """Recorded signals checked against all drivers of the logs, line by line.
+
+    Args:
+      parts: of `importers.parts`.
+      executor: where they are read; default: this process. Changes no number.
+
+    Raises:
+      InputError: logs that cannot be read.
+    """
     places = executor or Serial()
     return check_events(places.stream(_line_events, work_units(parts, places.workers)))
 

@@ -145,8 +145,14 @@ class SmoothTrack:
 def smooth_track(track: Track, rate_hz: float, window_s: float) -> SmoothTrack:
     """Resample to the uniform clock and smooth positions (Savitzky-Golay).
 
-    Gaps are bridged linearly; tracks shorter than the window [s] get the longest odd
-    one that fits, or none below 5 samples.
+    Args:
+      track: any track with at least one sample.
+      rate_hz: the clock, 1/s.
+      window_s: length of the filter window, s; tracks shorter than the window
+        get the longest odd window that fits, or none below 5 samples.
+
+    Returns:
+      The smoothed track; gaps are bridged linearly.
     """
     first = int(round(track.t[0] * rate_hz))
     last = int(round(track.t[-1] * rate_hz))

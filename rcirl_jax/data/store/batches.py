@@ -194,7 +194,12 @@ class BatchIterator:
         return {"epoch": self._epoch, "position": self._position, "seed": self._seed}
 
     def restore(self, state: Mapping[str, int]) -> None:
-        """Continues as the iterator that gave `state` would have."""
+        """Continues as the iterator that gave `state` would have.
+
+        Raises:
+          InputError: the state is of another seed, or lies outside an epoch of
+            these rows.
+        """
         epoch, position = state.get("epoch", -1), state.get("position", -1)
         inside = epoch >= 0 and 0 <= position < self.batches_per_epoch
         if not inside or state.get("seed") != self._seed:

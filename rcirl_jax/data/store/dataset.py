@@ -271,7 +271,11 @@ class Dataset(Demonstrations):
         return self.manifest.count
 
     def write_facts(self, body: Mapping[str, object]) -> None:
-        """Writes beside the manifest what made the dataset: commit, versions, flags."""
+        """Writes beside the manifest what made the dataset: commit, versions, flags.
+
+        Raises:
+          OSError: the place cannot be written.
+        """
         text = json.dumps(plain(body), indent=2, allow_nan=False) + "\n"
         self._files.write_many({FACTS: text.encode()})
 
@@ -280,7 +284,11 @@ class Dataset(Demonstrations):
         return self._body(FACTS, dict[str, Any], b"{}")
 
     def write_plans(self, plans: Sequence[Mapping[str, object]]) -> None:
-        """Writes the plans of sites (`data.plans.plan_of`) beside the manifest."""
+        """Writes the plans of sites (`data.plans.plan_of`) beside the manifest.
+
+        Raises:
+          OSError: the place cannot be written.
+        """
         text = json.dumps(plain(plans), allow_nan=False) + "\n"
         self._files.write_many({PLANS: text.encode()})
 

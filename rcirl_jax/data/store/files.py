@@ -57,7 +57,11 @@ class Files:
             ) from error
 
     def alone(self) -> contextlib.AbstractContextManager[None]:
-        """Holds the folder for this process; remote places cannot be held."""
+        """Holds the folder for this process; remote places cannot be held.
+
+        Raises:
+          InputError: another process holds the folder.
+        """
         if self.folder is None:
             return contextlib.nullcontext()
         return only_one(Path(self.folder))
@@ -77,7 +81,11 @@ class Files:
             ) from error
 
     def list_keys(self) -> list[str]:
-        """Returns all keys below the dataset, but for the lock of who writes it."""
+        """Returns all keys below the dataset, but for the lock of who writes it.
+
+        Raises:
+          InputError: one is no text.
+        """
         try:
             found = [key.decode() for key in self.wait(self.kv.list(), "")]
         except UnicodeDecodeError as error:

@@ -69,7 +69,16 @@ def leaf_specs() -> dict[str, jax.ShapeDtypeStruct]:
 
 
 def scene_name(rows: Demonstration, at: int, row: int) -> str:
-    """Names scene `at` in one line: its dataset row and the numbers that it carries."""
+    """Names a scene in one line: its dataset row and the numbers that it carries.
+
+    Recording and vehicle number the manifest's tables, the frame those of the
+    recording.
+
+    Args:
+      rows: demonstrations (numpy).
+      at: place of the scene among them.
+      row: its row in the dataset.
+    """
     numbers = ", ".join(
         f"{name} {int(np.asarray(getattr(rows, name))[at])}"
         for name in ("recording", "vehicle", "frame")
@@ -96,6 +105,9 @@ def refuse_scenes(
       rows: n demonstrations (numpy), or more than n.
       index: [n] their rows in the dataset.
       bad: name -> [n] bool, what is not finite of each scene.
+
+    Raises:
+      InputError: names the first such scene and all that is bad of it.
     """
     table = np.array(list(bad.values())).reshape(len(bad), -1)
     if table.any():
@@ -108,7 +120,11 @@ def refuse_scenes(
 
 
 def check_some(what: str, index: np.ndarray) -> None:
-    """Refuses a split without scenes."""
+    """Refuses a split without scenes.
+
+    Raises:
+      InputError: `index` is empty.
+    """
     if len(index) == 0:
         raise InputError(
             f"{what}: 0 scenes: expected at least one; import with test_fraction "

@@ -154,7 +154,16 @@ def time_blocks(
 def check_disjoint(
     groups: np.ndarray, vehicles: np.ndarray, split: Mapping[str, Sequence[int]]
 ) -> None:
-    """Check that no vehicle [n] is in two splits, of the numbers of groups [n]."""
+    """Check that no vehicle has rows in two splits.
+
+    Args:
+      groups: [n] group number per row.
+      vehicles: [n] vehicle number per row.
+      split: group numbers of each split, e.g. {"train": [0, 2], "test": [1]}.
+
+    Raises:
+      InputError: names the first vehicle number found in two splits.
+    """
     owner: dict[int, str] = {}
     for name, members in split.items():
         rows = np.isin(groups, np.asarray(members, np.int64))
@@ -171,7 +180,12 @@ def check_disjoint(
 
 
 class Resplit(Demonstrations):
-    """A dataset seen through other splits: name -> rows, each in one at most."""
+    """A dataset seen through other splits.
+
+    Args:
+      dataset: any dataset.
+      splits: name -> row numbers; a row may be in one split at most.
+    """
 
     def __init__(
         self, dataset: Demonstrations, splits: Mapping[str, np.ndarray]
@@ -215,7 +229,11 @@ class Resplit(Demonstrations):
 
 
 def by_recording(dataset: Demonstrations, recordings: Sequence[int]) -> Resplit:
-    """Holds out recordings; scenes of their egos elsewhere leave training too."""
+    """Holds out recordings; scenes of their egos elsewhere leave training too.
+
+    Raises:
+      InputError: none is named, or one has no scene.
+    """
     every = dataset.load(None)
     vehicle, where = np.asarray(every.vehicle), np.asarray(every.recording)
     found, named = np.unique(where), list(recordings)
@@ -232,6 +250,14 @@ def folds_by_recording(dataset: Demonstrations, count: int) -> list[Resplit]:
     """Holds every scene out once: recordings dealt into parts, one held out at a time.
 
     The largest recording first, each to the part with fewest scenes.
+
+    Args:
+      dataset: any dataset; its own split does not matter.
+      count: of parts, at least 2.
+
+    Raises:
+      InputError: fewer recordings than parts, or a part whose egos are those of all
+        other scenes.
     """
     where = np.asarray(dataset.load(None).recording)
     names, sizes = np.unique(where, return_counts=True)

@@ -313,7 +313,13 @@ def has_holes(seconds: np.ndarray) -> bool:
 
 
 def check_clock(path: Path, seconds: np.ndarray, columns: LogColumns) -> None:
-    """Refuses times of day read as numbers; `seconds` [n] with rows rise."""
+    """Refuses times of day as digits that were read as numbers.
+
+    Args:
+      path: of the log.
+      seconds: [n] whole seconds in which there are rows, rising.
+      columns: of the log.
+    """
     if columns.clock in ("s", "ms") and has_holes(seconds):
         form = [*CLOCK_DIGITS][columns.clock == "ms"]
         raise InputError(
@@ -538,6 +544,9 @@ def meaning_of(
       automated: all that the column of this field holds.
       columns: of the file.
       spec: source TOML.
+
+    Raises:
+      InputError: headings that contradict the positions, a flag neither yes nor no.
     """
     flags = flags_of(path, automated, spec)
     names, rate = {field.name for field in columns.fields}, columns.rate_hz
@@ -559,7 +568,15 @@ def flags_of(path: Path, texts: Iterable[str], spec: Mapping) -> dict[str, bool]
     """Returns text -> whether an automation drives, or nobody knows who does.
 
     An empty cell is unknown, which counts as automated. If all other cells say yes, an
-    empty one means no. `automated_values` of the source TOML are those that mean yes.
+    empty one means no.
+
+    Args:
+      path: named in errors.
+      texts: all that the column holds.
+      spec: source TOML; its `automated_values` are those that mean yes.
+
+    Raises:
+      InputError: a text that is neither yes nor no.
     """
     own, found = {item.lower() for item in spec.get(AUTOMATED, [])}, {}
     for text in filter(None, texts):
@@ -600,6 +617,9 @@ def heading_form(
       unit: rad or deg; "": whichever fits.
       spec: source TOML.
       rate_hz: rows per second of a road user.
+
+    Raises:
+      InputError: no convention, or not the declared one, agrees with the positions.
     """
     said = one_of(spec, CONVENTION, CONVENTIONS) if spec.get(CONVENTION) else ""
     headings = None

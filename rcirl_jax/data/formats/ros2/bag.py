@@ -238,7 +238,11 @@ def _of_sqlite(database: Database) -> BagFile:
 
 
 def as_sent(data: bytes) -> bytes:
-    """Returns a message, unpacked if rosbag2 compressed it by itself."""
+    """Returns a message, unpacked if rosbag2 compressed it by itself.
+
+    Raises:
+      ValueError: it is longer than MAX_MESSAGE_BYTES.
+    """
     size = len(data)
     if data.startswith(ZSTD_MAGIC):  # no CDR begins so
         zstandard = extra_module("zstandard", EXTRA)

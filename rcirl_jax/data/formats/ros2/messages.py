@@ -80,7 +80,10 @@ class Context:
     ) -> Pose:
         """Returns a place from a point and a quaternion of any length.
 
-        The heading is atan2(2 (w z + x y), w^2 + x^2 - y^2 - z^2).
+            heading = atan2(2 (w z + x y), w^2 + x^2 - y^2 - z^2)
+
+        Raises:
+          InputError: a number that is not finite, or a heading of the ego not set.
         """
         x, y, q = position.x, position.y, orientation
         for name, value in {"x": x, "y": y, "w": q.w, "z": q.z}.items():

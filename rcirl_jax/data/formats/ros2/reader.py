@@ -52,8 +52,12 @@ NEAR_M = 3.0  # m from a lane's centre line to a place on its stop line
 def given_lanes(path: Path, spec: dict) -> tuple[Sequence[Lane], list[str]] | None:
     """Reads the lanes of the option `map` or of [lanes] in the TOML, with notes.
 
-    In the frame of the bag's map; None where the TOML has neither. A table of lines
-    lies beside the bag, or beside its folder.
+    Args:
+      path: file of the bag; a table of lines lies beside it, or beside its folder.
+      spec: source TOML.
+
+    Returns:
+      Lanes in the frame of the bag's map; None where the TOML has neither.
     """
     place = path_option(spec, "map")
     if place and lane_file_of(spec):
@@ -82,7 +86,11 @@ def _on_square(latitude: np.ndarray, longitude: np.ndarray) -> np.ndarray:
 def lanes_near(
     lanes: Sequence[Lane], x: np.ndarray, y: np.ndarray, origin: np.ndarray
 ) -> tuple[Lane, ...]:
-    """Returns the lanes around positions [n] m of the bag, less the origin [2] m."""
+    """Returns the lanes around positions [n] m of the bag, less the origin [2] m.
+
+    Raises:
+      InputError: there are none.
+    """
     roads = Roads([lane.centre for lane in lanes], lanes.__getitem__)
     near = roads.around(x, y, origin, MARGIN_M)
     if not near:

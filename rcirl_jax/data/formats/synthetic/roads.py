@@ -101,11 +101,18 @@ def _envelope(speed: np.ndarray, braking: float) -> np.ndarray:
 def to_world(
     road: Road, s: np.ndarray, l: np.ndarray, slope: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """World position x, y [n] m and heading [n] rad of a motion along the road.
+    """World position and heading of a motion along the road.
 
         heading = heading_road + atan2(dl/ds, 1 - kappa l)
 
-    for stations s and offsets l [n] m, and slopes dl/ds [n].
+    Args:
+      road: the road.
+      s: [n] m, station.
+      l: [n] m, offset.
+      slope: [n] dl/ds.
+
+    Returns:
+      x, y [m] and heading [rad], each [n].
     """
     index = np.clip((s / GRID_M).astype(int), 0, road.x.size - 2)
     rest = s - index * GRID_M

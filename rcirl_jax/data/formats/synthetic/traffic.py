@@ -217,9 +217,14 @@ def idm_acceleration(
     leader_v: np.ndarray,
     driver: np.ndarray,
 ) -> np.ndarray:
-    """IDM acceleration [n] m/s^2 (module docstring), without the emergency bound.
+    """IDM acceleration [m/s^2] (module docstring), without the emergency bound.
 
-    `desired` is v0 [m/s]; `gap` [m] is bumper to bumper, inf without a leader.
+    Args:
+      v: [...] m/s, own speed.
+      desired: [...] m/s, v0 here and now.
+      gap: [...] m, bumper to bumper; inf without a leader.
+      leader_v: [...] m/s, the leader's speed; any number without a leader.
+      driver: [...] of CAR.
     """
     a, b = driver["acceleration_mps2"], driver["deceleration_mps2"]
     desired = np.maximum(desired, 0.5)
@@ -249,7 +254,11 @@ def line_acceleration(v: np.ndarray, gap: np.ndarray, driver: np.ndarray) -> np.
 
 
 class Neighbours:
-    """Finds who is ahead and behind; a car that changes lanes is in both rows."""
+    """Finds who is ahead and behind; a car that changes lanes is in both rows.
+
+    Args:
+      cars: [n] of CAR.
+    """
 
     def __init__(self, cars: np.ndarray) -> None:
         self._s = cars["s"].copy()
@@ -261,9 +270,10 @@ class Neighbours:
         self._keys, self._car, self._rows = keys[order], car[order], rows[order]
 
     def find(self, rows: np.ndarray, ahead: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Nearest car [n] ahead or behind in the row given; its distance [n] m.
+        """Finds the nearest car ahead of, or behind, each car in the row given for it.
 
-        From centre to centre; inf: nobody.
+        Returns:
+          Its index [n], and its distance [n] m from centre to centre; inf: nobody.
         """
         side, shift = ("right", 0) if ahead else ("left", -1)
         at = np.searchsorted(self._keys, rows * ROW_M + self._s, side) + shift

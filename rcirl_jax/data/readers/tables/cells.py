@@ -122,7 +122,12 @@ def day_and_second(digits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def times_of_day(digits: np.ndarray, form: str) -> Found:
-    """Returns s since midnight [n] of digits of one of CLOCK_DIGITS; NaN stays NaN."""
+    """Returns s since midnight [n] of digits such as 80459920; NaN stays NaN.
+
+    Args:
+      digits: [n] as numbers.
+      form: one of CLOCK_DIGITS.
+    """
     day, seconds = day_and_second(digits / CLOCK_DIGITS[form])
     return seconds, ~np.isnan(digits) & ((day != 0.0) | np.isnan(seconds))
 

@@ -27,7 +27,11 @@ def is_columnar(path: Path) -> bool:
 
 
 def columns_of(path: Path) -> list[str]:
-    """Returns the names of the columns."""
+    """Returns the names of the columns.
+
+    Raises:
+      InputError: a damaged file, or more columns than tables have.
+    """
     with _opened(path) as file:
         schema = getattr(file, "schema_arrow", None) or file.schema
         _check(path, "columns", len(schema), MAX_COLUMNS)
@@ -35,7 +39,11 @@ def columns_of(path: Path) -> list[str]:
 
 
 def columnar_batches(path: Path, names: Sequence[str]) -> Iterator[tuple[list, float]]:
-    """Yields (arrays of the columns, share of the file read) of some rows at a time."""
+    """Yields (arrays of the columns, share of the file read) of some rows at a time.
+
+    Raises:
+      InputError: a damaged file, or a row group too large to be held.
+    """
     is_parquet = first_bytes(path).startswith(PARQUET)
     wanted = list(dict.fromkeys(names))
     for batch, share in (_parquet if is_parquet else _feather)(path, wanted):

@@ -212,6 +212,9 @@ def drop_position_outliers(
       stats: of the file.
       distance: of differences in x and y.
       name_of: an id as the file has it.
+
+    Raises:
+      InputError: more rows than are allowed.
     """
     codes = np.unique(rows["id"], return_inverse=True)[1]
     order = np.lexsort((rows["t"], codes))

@@ -54,7 +54,11 @@ def first_bytes(path: Path, count: int = 64) -> bytes:
 
 
 def refuse_pointer(path: Path) -> None:
-    """Refuses the text of three lines that Git LFS leaves where it fetched no data."""
+    """Refuses the text of three lines that Git LFS leaves where it fetched no data.
+
+    Raises:
+      InputError: the file is one.
+    """
     if first_bytes(path, len(POINTER)) == POINTER:
         raise InputError(
             f"{path}: Git LFS pointer: expected the data themselves; run git lfs pull"
@@ -129,10 +133,15 @@ def head_of(
 ) -> tuple[str, bool, list[str]]:
     """Returns the encoding of a text, whether it is a guess, and its first lines.
 
+    The lines are fewer where they are long.
+
     Args:
       path: file.
       encoding: of its characters; "": recognised.
       known: names of which the text should hold some; they tell encodings apart.
+
+    Raises:
+      InputError: an empty file, no text, an unknown encoding, a line without an end.
     """
     is_guess = False
     if not encoding:
@@ -197,6 +206,9 @@ def blocks(
       encoding: of its characters.
       quote: inside of which a row may go on in the next line; "": nowhere.
       show: called with the bytes of the file just read.
+
+    Raises:
+      InputError: a damaged archive, a line without an end.
     """
     number, at = 1, 0
     with _text(path, encoding) as (text, file):

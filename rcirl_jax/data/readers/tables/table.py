@@ -155,6 +155,9 @@ def open_table(
       path: file.
       options: [table] of the source TOML, which wins over what is recognised.
       known: names that the table should hold, which may tell its encoding.
+
+    Raises:
+      InputError: no table.
     """
     if is_columnar(path):
         return Table(path=path, header=tuple(columns_of(path)))
@@ -212,6 +215,9 @@ def batches(
       fields: what is read; with `user`, the rows of all users come below each other.
       stats: counts what is dropped.
       show: called with the bytes of the file just read.
+
+    Raises:
+      InputError: a column is missing or of another type, or the file is damaged.
     """
     places = [table.place(field.column) for field in fields]
     if table.layout is not None:
@@ -359,7 +365,12 @@ def _below_each_other(parts: Sequence[Batch]) -> Batch:
 
 
 def number_texts(batch: Batch, known: dict[str, dict[str, int]]) -> Rows:
-    """Returns a batch with texts as numbers of `known`: field -> text -> number."""
+    """Returns a batch whose texts are numbers: those of `known`, which grows.
+
+    Args:
+      batch: of `batches`.
+      known: field -> text -> its number, in order of appearance.
+    """
     made = dict(batch)
     for name, column in batch.items():
         if isinstance(column, tuple):
@@ -383,7 +394,12 @@ def check_rows(table: Table, count: int) -> None:
 
 
 def read(table: Table, fields: Sequence[Field], stats: RowStats) -> Rows:
-    """Returns all readable rows: numbers, NaN where unknown; texts, "" likewise."""
+    """Returns all readable rows: numbers, NaN where unknown; texts, "" likewise.
+
+    Raises:
+      InputError: as `batches`; a table too long to be held whole, without rows, or
+        with more unreadable ones than are allowed.
+    """
     size = table.path.stat().st_size
     if size > MAX_BYTES:
         raise InputError(
