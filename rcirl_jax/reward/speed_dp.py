@@ -79,7 +79,8 @@ def point_cost(
     )
     near = jnp.maximum(weights.safe_distance - ahead, 0.0) ** 2
     near = near + jnp.maximum(weights.safe_distance - behind, 0.0) ** 2
-    return weights.speed * off_speed + weights.obstacle * near - weights.way * s
+    cost = weights.speed * off_speed + weights.obstacle * near - weights.way * s
+    return jnp.asarray(cost)
 
 
 def effort_cost(a: Float[Array, "..."], weights: SpeedDpCost) -> Float[Array, "..."]:
