@@ -69,7 +69,7 @@ SHARE = 0.5  # of the time left that the full run of the paper's amount may take
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """How much each part does."""
+    """Sizes of the parts."""
 
     scenes: int  # compared with the CPU
     drives: int  # likewise
@@ -91,7 +91,7 @@ SMALL = Sizes(
 
 
 def card() -> dict:
-    """What the driver says of the card; empty without one."""
+    """Returns what the driver says of the card; empty without one."""
     fields = "name,driver_version,memory.total,clocks.max.sm,power.limit"
     with contextlib.suppress(OSError, subprocess.CalledProcessError):
         command = ["nvidia-smi", f"--query-gpu={fields}", "--format=csv,noheader"]
@@ -104,7 +104,7 @@ def card() -> dict:
 
 
 def devices(_: Dataset, sizes: Sizes) -> dict:
-    """What JAX sees."""
+    """Returns the devices that JAX sees."""
     return {
         **machine(),
         **card(),

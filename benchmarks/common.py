@@ -1,4 +1,4 @@
-"""What the benchmarks share: hardware, percentiles, made datasets, the JSON."""
+"""Shared parts of the benchmarks: hardware, percentiles, made datasets, the JSON."""
 
 import contextlib
 import datetime

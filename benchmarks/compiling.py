@@ -1,4 +1,4 @@
-"""How long the programs take to compile, part by part.
+"""Compile seconds of the programs, part by part.
 
     python -m benchmarks.compiling                        # all rows
     python -m benchmarks.compiling --rows=sampler,F --before=OTHER.json

@@ -51,7 +51,7 @@ class Judged(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Site(msgspec.Struct, frozen=True):
-    """Where recordings lie below the folder of all data."""
+    """A place of recordings below the folder of all data."""
 
     format: str
     folder: str

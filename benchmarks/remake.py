@@ -43,7 +43,7 @@ _CHECK = flags.DEFINE_bool("check", False, "only say what is missing or of other
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """What makes some of the files; {out} is a folder of its own, {NAME} a dataset."""
+    """A command and its files; {out} is a folder of its own, {NAME} a dataset."""
 
     name: str
     minutes: int  # of two quiet cores
@@ -56,6 +56,10 @@ LEARNERS = (
     "RC-IRL rank,RC-IRL rank on curves,RC-IRL logistic,logistic free,MaxEnt,"
     "MaxEnt 32-16,MaxEnt monotone 32-16,GAN,GAN free,logistic linear,"
     "logistic non-negative,logistic 32-16"
+)
+DIALS = ",".join(  # of the chain: its gain times these, and its own
+    f"{{after}}/{file}.msgpack"
+    for file in ("dials/0.25", "dials/0.5", "weights", "dials/2", "dials/4")
 )
 THREE = "--data={us101},{urban},{i80} --output={out}"
 COMMANDS = (
@@ -157,19 +161,16 @@ COMMANDS = (
     Command(
         "dial_ranking",
         2,
-        "rcirl_jax rank --weights={after}/dials/0.25.msgpack,{after}/dials/0.5.msgpack,"
-        "{after}/weights.msgpack,{after}/dials/2.msgpack,{after}/dials/4.msgpack "
-        "--data={us101},{urban},{i80} --output={out}/ranking.json",
+        f"rcirl_jax rank --weights={DIALS} --data={{us101}},{{urban}},{{i80}} "
+        "--output={out}/ranking.json",
         {"dial_ranking": "ranking.json"},
         after="chain",
     ),
     Command(
         "gains",
         15,
-        "rcirl_jax simulate --weights={after}/dials/0.25.msgpack,"
-        "{after}/dials/0.5.msgpack,{after}/weights.msgpack,{after}/dials/2.msgpack,"
-        "{after}/dials/4.msgpack --suite=full --cases=10 --catalogue_seed=1 "
-        "--baselines=hand-set --output={out}",
+        f"rcirl_jax simulate --weights={DIALS} --suite=full --cases=10 "
+        "--catalogue_seed=1 --baselines=hand-set --output={out}",
         {"gains": "suite.json"},
         after="chain",
     ),
@@ -206,7 +207,7 @@ def rounded(x: object) -> object:
 
 
 def made_of(path: Path) -> str:
-    """What made a file: "" if today's code did, else what is wrong with it."""
+    """Returns "" for a file that today's code made, else what is wrong with it."""
     if not path.is_file():
         return "missing"
     code = read_json(path, "JSON").get("made_by", {}).get("code_sha256")

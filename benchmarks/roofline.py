@@ -1,4 +1,4 @@
-"""What a query costs at least, and what the machine could do: peaks and counts.
+"""Least cost of a query, and the peaks of the machine.
 
 Peaks are measured: a matrix product and an update a + s b of long arrays under jit.
 The network is counted by hand, sampler and features from their jaxprs.

@@ -72,6 +72,12 @@ def mean_of(distance: Mapping) -> str:
     return amount({"value": distance["mean"], **distance}, 2)
 
 
+def nuplan(row: Mapping) -> str:
+    """Returns a suite row's score in points with its interval."""
+    keys = {"value": "nuplan", "low": "nuplan_low", "high": "nuplan_high"}
+    return amount({key: row[of] for key, of in keys.items()}, 1, 100.0)
+
+
 def sentence() -> str:
     """The verdict of the gate."""
     return f"> {read('chain_verdict')['sentence']}\n"
@@ -134,8 +140,7 @@ def suite() -> str:
                 f"{x['at_fault']}",
                 f"{x['red_lights']}, {x['stop_signs']}",
                 f"{100.0 * x['progress_m'] / rows['IDM']['progress_m']:.1f}",
-                f"{100.0 * x['nuplan']:.1f} "
-                f"[{100.0 * x['nuplan_low']:.1f}, {100.0 * x['nuplan_high']:.1f}]",
+                nuplan(x),
             )
             for name, x in ((name, rows[name]) for name in DRIVERS)
         ),
@@ -219,24 +224,28 @@ def dial() -> str:
     """The learned part's gain turned from 0 to four times the run's."""
     ways = {"nuplan": 1, "progress": 1, "rms_acceleration": 2, "rms_jerk": 2}
     head = ("gain", "nuPlan", "progress, % of hand-set's", "RMS acceleration")
-    ranked = read("dial_ranking")["rows"]
-    top1 = {name: amount(x["top1_fde"], 2) for name, x in ranked.items()}
+    ranked, driven = read("dial_ranking")["rows"], read("gains")["report"]["rows"]
 
-    def row_of(dial: float) -> str:
-        """The ranking's row, which is called after its file."""
+    def of_dial(rows: Mapping, dial: float) -> Mapping:
+        """The row of a dial, which is called after its file."""
         if not dial:
-            return "hand-set"
+            return rows["hand-set"]
         file = "weights" if dial == 1.0 else f"{dial:g}"
-        return next(name for name in top1 if name.endswith(f"({file}.msgpack)"))
+        return next(x for name, x in rows.items() if name.endswith(f"({file}.msgpack)"))
+
+    def at_stop_signs(dial: float) -> float:
+        """Share of the way, on cases that nothing else is measured on."""
+        return of_dial(driven, dial)["families"]["stop_sign"]["progress_ratio"]
 
     return markdown(
-        (*head, "RMS jerk", "distance to the human, m", "top-1, m"),
+        (*head, "RMS jerk", "distance, m", "top-1, m", "stop signs, other cases, %"),
         (
             (
                 f"{x['gain']:.3g}" if x["dial"] else "0: hand-set",
                 *(f"{x['measures'][k]['value']:.{n}f}" for k, n in ways.items()),
                 amount(x["measures"]["distance"], 2),
-                top1[row_of(x["dial"])],
+                amount(of_dial(ranked, x["dial"])["top1_fde"], 2),
+                f"{100.0 * at_stop_signs(x['dial']) / at_stop_signs(0.0):.1f}",
             )
             for x in read("chain_dial")["settings"]
         ),
@@ -287,8 +296,7 @@ def own_terms() -> str:
             mean_of(drive["distance_m"]) if drive else "",
             *(
                 (
-                    f"{100.0 * case['nuplan']:.1f} [{100.0 * case['nuplan_low']:.1f}, "
-                    f"{100.0 * case['nuplan_high']:.1f}]",
+                    nuplan(case),
                     f"{case['physical']['rms_j']:.2f}",
                     f"{case['progress_m']:.0f}",
                 )

@@ -38,7 +38,7 @@ def enough_epochs(data: Demonstrations, batch_size: int) -> int:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StepSize:
-    """How the step size of a learner was chosen, on validation scenes alone."""
+    """A learner's step size, chosen on validation scenes alone."""
 
     chosen: float
     # rate that trains -> mean distance of the chosen candidate from the human, m

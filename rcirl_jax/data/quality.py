@@ -224,7 +224,7 @@ def assumed(recording: Recording) -> dict[str, int]:
 
 
 def remedies(dropped: Mapping[str, int]) -> str:
-    """Why scenes were dropped, most frequent first, and what to do about each."""
+    """Returns why scenes were dropped, most frequent first, with remedies."""
     counts = sorted(dropped.items(), key=lambda item: -item[1])
     return "; ".join(
         f"{count:,} {name}: try {REMEDIES[name]}" for name, count in counts if count

@@ -1,4 +1,4 @@
-"""Why one trajectory is valued above another: each feature's share at each time.
+"""Shares of features and times in one trajectory being valued above another.
 
 The difference V(a) - V(b) is split over features and times by integrated
 gradients. The shares add up to the difference, a feature that is the same in

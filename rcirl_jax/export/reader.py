@@ -221,9 +221,8 @@ class Reward:
         if others.dtype.kind not in "fiu":
             _fail(f"{self.file}: incumbent", others.dtype, "numbers")
         with np.errstate(all="ignore"):
-            total = others.astype(np.float32) + self.prior_cost.gain * values.astype(
-                float
-            )
+            added = self.prior_cost.gain * values.astype(float)
+            total = others.astype(np.float32) + added
             total = np.asarray(total).astype(np.float32)
         return self._finite("total", total, "finite values of the incumbent")
 

@@ -123,9 +123,9 @@ def _ratio(x: jax.Array, valid: jax.Array) -> jax.Array:
 def approach_speed(
     stop: Float[Array, "..."], virtual: Float[Array, "..."], weights: LatticeCost
 ) -> Float[Array, "..."]:
-    """The speed m/s from which the nearer of two lines, m away, is reached gently.
+    """Returns the speed m/s from which the nearer of two lines, m away, is met gently.
 
-    sqrt(2 * comfort_braking * distance), or inf where there is none
+    sqrt(2 comfort_braking distance), inf where there is none; broadcast
     """
     to_stop = jnp.minimum(stop, virtual)
     braking = jnp.sqrt(jnp.multiply(2.0, weights.comfort_braking) * to_stop)
@@ -135,9 +135,9 @@ def approach_speed(
 def nearness(
     ahead: Float[Array, "..."], behind: Float[Array, "..."], weights: LatticeCost
 ) -> Float[Array, "..."]:
-    """How near one comes to who is ahead and behind, gaps in m: 1 within the buffers.
+    """Returns 1 within the buffers to who is ahead and behind, less beyond; gaps in m.
 
-    exp(-distance^2 / (2 sigma^2))
+    exp(-distance^2 / (2 sigma^2)), broadcast
     """
     distance = jnp.minimum(
         jnp.maximum(ahead - weights.yield_buffer, 0.0),

@@ -1,4 +1,4 @@
-"""What each log format says of itself; loads no reader."""
+"""Declarations of the log formats; loads no reader."""
 
 import dataclasses
 from collections.abc import Mapping
