@@ -10,7 +10,10 @@ gives the byte layout; the equation is
 
 A reward with a prior cost is driven on the planner's own cost:
 
-    V_total = V_incumbent + gain V
+    V_total = V_incumbent + gain V    where V knows the scene, else V_incumbent
+
+It does not where a feature that never varied in training (`unsupported`) has another
+value at the first time: nobody was recorded there.
 
     reward = load_weights("weights.msgpack")
     print(reward.describe())             # what it was trained for, and what not
@@ -201,6 +204,10 @@ class Reward:
     ) -> np.ndarray:
         """Return V_incumbent + gain V of trajectories; higher is better.
 
+        V counts where it knows the scene: at the first time, if that is valid, every
+        feature of `unsupported` is within its scale of its location. Elsewhere the
+        total is V_incumbent.
+
         Args:
           features: as `value`.
           incumbent: [...] the incumbent's values (its cost, negated), broadcast to
@@ -222,9 +229,18 @@ class Reward:
             _fail(f"{self.file}: incumbent", others.dtype, "numbers")
         with np.errstate(all="ignore"):
             added = self.prior_cost.gain * values.astype(float)
+            added = np.where(self._knows(np.asarray(features), time_valid), added, 0.0)
             total = others.astype(np.float32) + added
             total = np.asarray(total).astype(np.float32)
         return self._finite("total", total, "finite values of the incumbent")
+
+    def _knows(self, features: np.ndarray, time_valid: np.ndarray | None) -> np.ndarray:
+        first = features[..., 0, :].astype(np.float32)
+        other = np.abs(first - self.location) > self.scale
+        other = np.any(other & (self.lower >= self.upper), axis=-1)
+        return (
+            ~other if time_valid is None else ~(other & np.asarray(time_valid)[..., 0])
+        )
 
     def _finite(self, name: str, values: np.ndarray, expected: str) -> np.ndarray:
         bad = np.argwhere(~np.isfinite(values)).tolist()

@@ -6,9 +6,9 @@
 over accelerations k with m + k >= 0, |k - k-| within the jerk limit, free of bodies and
 walls at the next station and halfway to it, and within the speed rule. own is the
 planner's own cost as a sum over times (`reward.time_sums`), gain that of
-`planner.rank`; a reward without a prior cost has own 0 and gain 1. Apollo's speed DP
-keeps (t, s) only and reads v and a off its single best predecessor, so it is not
-optimal for its own cost.
+`planner.rank`, and 0 where V does not know the scene; a reward without a prior cost has
+own 0 and gain 1. Apollo's speed DP keeps (t, s) only and reads v and a off its single
+best predecessor, so it is not optimal for its own cost.
 
 One backward `lax.scan` over time makes an int8 policy, one forward scan reads plans off
 it: the best of each of the most valued beginnings. A lattice's plan has jerk in steps,
@@ -77,6 +77,7 @@ from rcirl_jax.reward.network import (
     layers_of,
     matmul_f32,
 )
+from rcirl_jax.reward.normaliser import supported
 from rcirl_jax.reward.time_sums import TIME_SUMS, Grid, TimeSum
 from rcirl_jax.sampling import sample
 from rcirl_jax.sampling.kinematics import (
@@ -221,6 +222,9 @@ def make_lattice(
         v=ego.v.at[0].set(scene.ego.v), a=ego.a.at[0].set(scene.ego.a), j=ego.j * 0.0
     )
     valid = scene.time_valid
+    first_row, gain = features(scene, start)[0], jnp.asarray(objective.gain)
+    if objective.own != "constant V":
+        gain = jnp.where(supported(weights[1], first_row), gain, 0.0)
     blocked = _blocked(scene, config)
     grid = Grid(
         stations,
@@ -239,8 +243,8 @@ def make_lattice(
         blocked_after=blocked[1::2],
         speed_cap=_speed_cap(scene, stations, config),
         first=jax.tree.map(lambda x: x[0], start),
-        first_row=features(scene, start)[0],
-        weight=jnp.where(valid, objective.gain / unit * weights[0]["gamma"], 0.0),
+        first_row=first_row,
+        weight=jnp.where(valid, gain / unit * weights[0]["gamma"], 0.0),
         own=own.replace(**scaled),
         unit=unit,
         has_next=jnp.concatenate([valid[1:], jnp.zeros((1,), bool)]),

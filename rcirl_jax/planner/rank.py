@@ -6,11 +6,12 @@ and the tracking are the same for a learned, a hand-set and a random reward.
 
 A learned score added to the planner's own cost, with a gain for each scene.
 
-    V = V_own + gain V_learned
+    V = V_own + gain V_learned    where V_learned knows the scene, else V_own
 
 A reward learned on some roads knows little of others: the larger the gain, the more it
 decides beyond plans that the planner's own cost finds nearly equal. The gain is in
-units of the own cost per unit of V, and the same in all scenes.
+units of the own cost per unit of V, and the same in all scenes but those with what
+training never showed (`reward.normaliser.supported`).
 """
 
 import dataclasses
@@ -33,6 +34,7 @@ from rcirl_jax.reward.network import (
     effective_model,
     scene_values,
 )
+from rcirl_jax.reward.normaliser import supported
 from rcirl_jax.reward.speed_dp import SPEED_DP_ROW, speed_dp_cost
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.sampling.sampler import family_index
@@ -244,7 +246,10 @@ def ranking_score(
         rows = features.rows(scene, candidates)
         model = effective_model(params.reward, activation)
         values = value_rows(model, params.reward, params.normaliser, rows, scene)
-        return params.gain * values
+        first = jnp.stack([row[0, 0] for row in rows])  # as for the gates
+        alone = params.own == list(OWN_SCORES).index("constant V")
+        counts = alone | supported(params.normaliser, first)
+        return jnp.where(counts, params.gain * values, 0.0)
 
     def score(params: Ranking, scene: Scene, candidates: Candidates) -> jax.Array:
         seen = scene, candidates

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap
@@ -101,6 +101,24 @@ def unsupported(lower: ArrayLike, upper: ArrayLike, names: Sequence[str]) -> lis
     """
     empty = np.asarray(lower) >= np.asarray(upper)
     return [name for name, none in zip(names, empty, strict=True) if none]
+
+
+def supported(normaliser: Normaliser, first: Float[Array, " f"]) -> Bool[Array, ""]:
+    """Returns whether V knows scenes like this one, from the features [F] at t = 0.
+
+        all over f with lower_f >= upper_f:  |x_f - location_f| <= scale_f
+
+    A feature that never varied in training has no effect on V. Where it has another
+    value than it always had, a stop line ahead for one, people were not recorded, and
+    V says nothing of what they would do.
+
+    Args:
+      normaliser: [F].
+      first: of one trajectory, raw.
+    """
+    empty = normaliser.lower >= normaliser.upper
+    other = jnp.abs(first - normaliser.location) > normaliser.scale
+    return ~jnp.any(empty & other)
 
 
 def seen_range(features: np.ndarray, feature_map: FeatureMap) -> np.ndarray:

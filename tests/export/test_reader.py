@@ -1,6 +1,7 @@
 """The reader: stands alone, refuses every damaged file with one line, scores."""
 
 import ast
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -124,6 +125,30 @@ def test_the_total_is_the_incumbents_value_and_the_gained_one():
     plain = decode_weights(packed())
     np.testing.assert_array_equal(reward.value(features), plain.value(features))
     assert reward.total(features[0], np.ones(())).shape == ()
+
+
+def test_v_counts_only_where_it_knows_the_scene():
+    """Feature 1 never varied in training: there it has no effect, and it tells."""
+    weights = example_weights(with_prior=True)
+    features, valid, _ = example_samples(weights, count=8, seed=4)
+    empty = [x.copy() for x in (weights.lower, weights.upper)]
+    for end in empty:
+        end[1] = weights.location[1]
+    lower, upper = empty
+    reward = dataclasses.replace(weights, lower=lower, upper=upper)
+    shares = np.array([0.0, -0.99, 1.01, -1.01, 1e9, 0.5, np.inf, 1.01], np.float32)
+    features[:, 0, 1] = weights.location[1] + shares * weights.scale[1]
+    valid[:, 0] = True
+    valid[7] = [False, True, True, True]  # what is not valid may be anything
+    knows = np.array([1, 1, 0, 0, 0, 1, 0, 1])
+    own = np.linspace(-3.0, 50.0, 8)
+    values = reward.value(features, valid)
+    assert np.all(values != 0.0)
+    found = reward.total(features, own, valid)
+    np.testing.assert_allclose(found, own + 1.5 * knows * values, rtol=1e-6)
+    knows[7] = 0
+    values, found = reward.value(features), reward.total(features, own)
+    np.testing.assert_allclose(found, own + 1.5 * knows * values, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

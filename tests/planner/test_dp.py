@@ -206,6 +206,24 @@ def test_an_own_cost_that_is_a_sum_is_searched_exactly(own):
     assert found >= 2
 
 
+def test_a_search_is_by_the_own_cost_where_v_does_not_know_the_scene():
+    made = scene_of(0)
+    params, norm = weights(0)
+    at = FEATURES.names.index("velocity")
+    elsewhere = norm.location.at[at].set(float(made.ego.v) + 1.1 * norm.scale[at])
+    values = {}
+    for name, end in (("known", norm.upper), ("new", norm.lower.at[at].set(99.0))):
+        w = params, norm.replace(location=elsewhere, lower=end - 1.0, upper=end)
+        if name == "new":
+            w = params, w[1].replace(lower=end)
+        values[name] = [
+            float(best(made, w, COARSE, gain=gain, own="+velocity").value)
+            for gain in (0.0, 3.0)
+        ]
+    assert values["new"][0] == values["new"][1]
+    assert values["known"][0] != values["known"][1]
+
+
 def test_ratios_are_linear_about_the_reference():
     """A step away from it, the sum moves by as much as Apollo's cost does."""
     made = free(scene_of(2))

@@ -14,7 +14,7 @@ from rcirl_jax.export.reader import PriorCost
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.rank import ONLINE, hand_score, learned_score
 from tests.helpers.scenes import random_scene, sampled
-from tests.helpers.weights_files import random_weights
+from tests.helpers.weights_files import LOWER, UPPER, random_weights
 
 FEATURES = feature_map("paper21")
 
@@ -47,6 +47,35 @@ def test_the_value_counts_as_much_as_the_gain_says(tmp_path):
     assert scorer.incumbent == "hand-set"
     ranked = scorer.total(features, np.asarray(theirs), valid)
     np.testing.assert_array_equal(ranked, total)
+
+
+@pytest.mark.parametrize(("off", "knows"), [(0.9, True), (1.1, False)])
+def test_v_is_silent_where_a_feature_is_new(tmp_path, off, knows):
+    """A speed limit that never varied in training is now `off` scales away."""
+    drawn = open_reward(str(random_weights(tmp_path / "w.msgpack")))
+    scene, at = random_scene(3), FEATURES.names.index("speed_limit")
+    candidates = sampled(jax.random.key(0), scene, ONLINE)
+    features = np.asarray(jax.jit(FEATURES.of_candidates)(scene, candidates))
+    valid = np.broadcast_to(np.asarray(scene.time_valid), features.shape[:2])
+    location = drawn.location.copy()
+    location[at] = features[0, 0, at] + off * drawn.scale[at]
+    ends = [np.where(np.arange(21) == at, location, x) for x in (LOWER, UPPER)]
+    lower, upper = (x.astype(np.float32) for x in ends)
+    made = dataclasses.replace(drawn, lower=lower, upper=upper, location=location)
+    reward = with_prior_cost(made, 1.15)
+    score, params = score_of(reward)
+    found = jax.jit(score)(params, scene, candidates)
+    theirs = np.asarray(jax.jit(hand_score)(None, scene, candidates))
+    ours = reward.value(features, valid)
+    assert np.ptp(ours) > 0.1
+    wanted = theirs + 1.15 * knows * ours
+    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-3)
+    total = reward.total(features, theirs, valid)
+    np.testing.assert_allclose(total, wanted, rtol=1e-5)
+    # alone it has nothing to give way to
+    score, params = score_of(made)
+    alone = jax.jit(score)(params, scene, candidates)
+    np.testing.assert_allclose(alone, ours, rtol=1e-4, atol=1e-3)
 
 
 def test_a_file_with_a_prior_cost_drives_on_top_of_it(tmp_path, monkeypatch):

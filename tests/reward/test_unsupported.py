@@ -12,7 +12,7 @@ from rcirl_jax.reward import (
     init_params,
     value,
 )
-from rcirl_jax.reward.normaliser import VARYING_SHARE, unsupported
+from rcirl_jax.reward.normaliser import VARYING_SHARE, supported, unsupported
 
 FEATURES = feature_map("paper21")
 NEVER = ("stop_distance", "stop_speed", "virtual_distance", "virtual_speed")
@@ -79,3 +79,14 @@ def test_their_weights_change_no_value_and_get_no_gradient():
     slope = np.asarray(grad["point"]["hidden_0"]["kernel"])
     assert not np.any(slope[at])
     assert np.all(np.any(slope, axis=1)[: FEATURES.num_features - 8])
+
+
+def test_a_scene_is_known_while_they_are_as_they_always_were():
+    _, norm = weights()
+    usual = norm.location.at[FEATURES.names.index("velocity")].set(1e3)  # it varies
+    assert bool(supported(norm, usual))
+    at = FEATURES.names.index("stop_distance")
+    assert float(norm.location[at]) == 60.0  # m: no line
+    for distance, known in ((59.0, True), (58.0, False), (0.0, False)):
+        assert bool(supported(norm, usual.at[at].set(distance))) == known
+    assert not bool(supported(norm, usual.at[at + 1].set(-10.0)))

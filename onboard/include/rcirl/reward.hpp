@@ -108,6 +108,9 @@ class Reward {
 
   // V_incumbent + gain V of trajectories, with a prior cost; higher is better.
   //
+  // V counts where it knows the scene: at the first time, if that is valid, every feature of
+  // `unsupported` is within its scale of its location. Elsewhere the total is V_incumbent.
+  //
   //   incumbent  [K] its values (a cost, negated); may be the same memory as `values`
   //
   // The rest as `score`, which refuses the same candidates. Refused are also those without
@@ -252,7 +255,11 @@ inline std::size_t Reward::total(const float* features, std::size_t count, Mask 
     score(features + first * row, lanes, marks, workspace, values + first);
     for (std::size_t k = 0; k < lanes; ++k) {
       float& value = values[first + k];
-      const double sum = static_cast<double>(own[k]) + gain() * static_cast<double>(value);
+      const bool begins = marks.data == nullptr || marks.data[k * stride] != 0;
+      const bool known = !begins || detail::knows(network, features + (first + k) * row);
+      const double added = gain() * static_cast<double>(value);
+      // a value that was refused stays so, whether it counts or not
+      const double sum = static_cast<double>(own[k]) + (known || value == kNone ? added : 0.0);
       const bool finite = std::abs(sum) <= double{std::numeric_limits<float>::max()};
       value = finite ? static_cast<float>(sum) : kNone;
       refused += !finite;

@@ -161,6 +161,16 @@ inline void normalise(const Network& network, const float* const* rows, Lanes* x
   }
 }
 
+// Whether V knows a scene, from the raw features [F] of one trajectory at the first time: those
+// without effect, which never varied in training, are within their scale of their location.
+inline bool knows(const Network& network, const float* first) {
+  for (std::size_t f = 0; f < network.features; ++f) {
+    const bool empty = network.lower[f] >= network.upper[f];
+    if (empty && std::abs(first[f] - network.location[f]) > network.scale[f]) return false;
+  }
+  return true;
+}
+
 // gates = 2 / (1 + exp(-x C)), [F].
 inline void feature_gates(const Network& network, const Lanes* x, Lanes* gates) {
   const std::size_t size = network.features;
