@@ -19,6 +19,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.runtime.atomic_files import read_json, write_json
 from rcirl_jax.runtime.checked import checked
+from rcirl_jax.sampling.sampler import MODES
 from rcirl_jax.simulation.rows import Row
 from rcirl_jax.simulators.drive import drive
 from rcirl_jax.simulators.simulators import SIMULATORS, Simulator, open_simulator
@@ -32,7 +33,10 @@ from rcirl_jax.simulators.table import (
 )
 
 ROWS = ("hand-set", "IDM", "constant V", "+velocity", "random weights")
-USUAL = ("simulator", "weights", "episodes", "output", "seconds", "baselines", "also")
+USUAL = (
+    *("simulator", "weights", "episodes", "output", "seconds", "baselines"),
+    *("mode", "also"),
+)
 _SIMULATOR = flags.DEFINE_string(
     "simulator", None, f"one of {', '.join(SIMULATORS)}", required=True
 )
@@ -48,6 +52,13 @@ _SECONDS = flags.DEFINE_float("seconds", 30.0, "s that an episode lasts, 1 to 60
 _SEED = flags.DEFINE_integer("seed", 0, "of the episodes")
 _BASELINES = flags.DEFINE_list(
     "baselines", ",".join(ROWS), "baselines that drive too, or empty"
+)
+_MODE = flags.DEFINE_enum(
+    "mode",
+    None,
+    MODES,
+    "what baselines that rank candidates plan: speed along their lane, or paths and "
+    "lane changes too; default: what the first weights were trained for",
 )
 _ALSO = flags.DEFINE_list(
     "also",
@@ -74,7 +85,7 @@ def _driven_before(made_by: Mapping, fixed: Set[str]) -> Results:
         file = folder / "made_by.json"
         found = read_json(file, "an output of drive-elsewhere")
         then = checked(found, _MadeBy, file)
-        for flag in ("simulator", "seconds"):
+        for flag in ("simulator", "seconds", "mode"):
             was, now = then.flags.get(flag), made_by["flags"][flag]
             if was != now:
                 raise InputError(f"--also: {folder}: --{flag}: {was}: expected {now}")
@@ -114,7 +125,7 @@ def main() -> None:
     options = {name: value for name, _, value in parts}
     simulator = open_simulator(_SIMULATOR.value, **options)
     made_by = provenance(_WEIGHTS.value)
-    rows = table_rows(_WEIGHTS.value, _BASELINES.value)
+    rows = table_rows(_WEIGHTS.value, _BASELINES.value, mode=_MODE.value)
     who = [*rows, *simulator.own_drivers]
     fixed = {*_BASELINES.value, *simulator.own_drivers} - {"random weights"}
     before = _driven_before(made_by, fixed)

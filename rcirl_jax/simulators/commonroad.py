@@ -38,6 +38,7 @@ class CommonRoad:
     """
 
     name = "commonroad"
+    changes_lanes = False
     together = 4
 
     def __init__(self, scenarios: str, python: str, weights: str = "") -> None:

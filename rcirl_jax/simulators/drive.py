@@ -2,8 +2,9 @@
 
 A row of the closed-loop tables is a policy with its weights behind the same sampler and
 safety filter, planning at 10 Hz with plans that are kept. The ego follows its plan as
-the ego of the package's own simulator does, through a drive train with a lag. `drive`
-is the loop: look, plan for all episodes at once, step.
+the ego of the package's own simulator does, through a drive train with a lag; where
+paths are planned, it is as far beside its centre line as the plan says. `drive` is the
+loop: look, plan for all episodes at once, step.
 """
 
 import dataclasses
@@ -21,7 +22,15 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.own_planner.builder import LineFrame, Parts, scene_of
 from rcirl_jax.geometry.frenet import ReferenceLine, project_lanes
-from rcirl_jax.planner.plan import Plan, command, later, no_plan, stations_from_now
+from rcirl_jax.planner.plan import (
+    Plan,
+    beside,
+    command,
+    later,
+    no_plan,
+    path_at,
+    stations_from_now,
+)
 from rcirl_jax.planner.rank import Policy
 from rcirl_jax.simulation.rows import Row
 from rcirl_jax.simulation.world import Vehicle
@@ -147,6 +156,7 @@ class Next(flax.struct.PyTreeNode, kw_only=True):
     speed: jax.Array  # [] m/s
     acceleration: jax.Array  # [] m/s^2
     future: jax.Array  # [T, 3] t s, way m, speed m/s
+    beside: jax.Array | None  # [3] offset m, slope 1, second derivative 1/m
     fallback: jax.Array  # [] bool, no candidate was admissible
 
 
@@ -171,6 +181,7 @@ def follow(plan: Plan, v: jax.Array, a: jax.Array, vehicle: Vehicle) -> Next:
         speed=speed,
         acceleration=took,
         future=jnp.stack([times, stations_from_now(plan), rates], axis=1),
+        beside=None if plan.path is None else path_at(plan, STEP_S),
         fallback=plan.fallback,
     )
 
@@ -179,11 +190,17 @@ def follow(plan: Plan, v: jax.Array, a: jax.Array, vehicle: Vehicle) -> Next:
 def _step_of(policy: Policy, vehicle: Vehicle) -> Callable[..., tuple[Next, Plan]]:
     """Return the compiled step [B] of a policy: plan, then follow for 0.1 s."""
 
-    def step(params: Any, scene: Scene, key: jax.Array, before: Plan) -> Any:  # noqa: ANN401
-        plan = policy(params, scene, key, before)
+    def step(
+        params: Any,  # noqa: ANN401
+        scene: Scene,
+        key: jax.Array,
+        before: Plan,
+        aside: jax.Array,
+    ) -> Any:  # noqa: ANN401
+        plan = policy(params, scene, key, beside(before, aside))
         return follow(plan, scene.ego.v, scene.ego.a, vehicle), later(plan, STEP_S)
 
-    return jax.jit(jax.vmap(step, in_axes=(None, 0, 0, 0)))
+    return jax.jit(jax.vmap(step, in_axes=(None, 0, 0, 0, 0)))
 
 
 _fold_in = jax.jit(jax.vmap(jax.random.fold_in, in_axes=(0, None)))
@@ -198,23 +215,25 @@ class Driver:
     """
 
     def __init__(self, row: Row, seeds: Sequence[int]) -> None:
-        if row.steers:
-            raise InputError(
-                f"{row.name}: mode: path_speed: expected speed: in other simulators "
-                "planners drive along given paths"
-            )
         self._row, self._step = row, _step_of(row.policy, Vehicle())
         self._plans = jax.tree.map(
-            lambda x: jnp.broadcast_to(x, (len(seeds), *jnp.shape(x))), no_plan()
+            lambda x: jnp.broadcast_to(x, (len(seeds), *jnp.shape(x))),
+            no_plan(row.steers),
         )
         self._keys = jax.vmap(jax.random.key)(np.asarray(seeds, np.uint32))
         self._time = 0
 
-    def moves(self, scenes: Scene) -> tuple[list[Move], np.ndarray]:
-        """Return each ego's next move, and whether nothing was admissible [B]."""
+    def moves(self, scenes: Scene, aside: np.ndarray) -> tuple[list[Move], np.ndarray]:
+        """Return each ego's next move, and whether nothing was admissible [B].
+
+        Args:
+          scenes: [B].
+          aside: [B] m, `View.aside`.
+        """
         keys = _fold_in(self._keys, self._time)
         self._time += 1
-        made, self._plans = self._step(self._row.params, scenes, keys, self._plans)
+        given = self._row.params, scenes, keys, self._plans, aside
+        made, self._plans = self._step(*given)
         made = jax.device_get(made)
         moves = [
             Move(
@@ -222,10 +241,24 @@ class Driver:
                 speed=float(made.speed[n]),
                 acceleration=float(made.acceleration[n]),
                 future=made.future[n],
+                beside=None if made.beside is None else tuple(made.beside[n].tolist()),
             )
             for n in range(len(made.way))
         ]
         return moves, made.fallback
+
+
+def refuse_paths(row: Row, simulator: str) -> None:
+    """Refuse a row that plans paths where egos stay in the middle of their lane.
+
+    Raises:
+      InputError: it does.
+    """
+    if row.steers:
+        raise InputError(
+            f"{row.name}: mode: path_speed: expected speed: in {simulator} rows of "
+            "ours drive along given paths"
+        )
 
 
 def drive(
@@ -241,6 +274,8 @@ def drive(
       seconds: that an episode lasts; a collision ends it earlier.
     """
     row = None if isinstance(who, str) else who
+    if row is not None and not simulator.changes_lanes:
+        refuse_paths(row, simulator.name)
     running = simulator.start(episodes, who if isinstance(who, str) else None)
     # batches have one size, so that each row is compiled once
     lanes = simulator.together
@@ -259,7 +294,9 @@ def drive(
             scenes, free = seen.scenes(views + [None] * (lanes - len(views)))
             moves, fallback = [None] * len(views), np.zeros(lanes, bool)
             if driver:
-                made, fallback = driver.moves(scenes)
+                aside = np.zeros(lanes, np.float32)
+                aside[: len(views)] = [0.0 if x is None else x.aside for x in views]
+                made, fallback = driver.moves(scenes, aside)
                 moves = [view and move for view, move in zip(views, made, strict=False)]
             running.step(moves)
             for n, (view, after) in enumerate(zip(views, running.look(), strict=True)):

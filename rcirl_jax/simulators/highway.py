@@ -1,9 +1,10 @@
 """highway-env (Leurent 2018), the gymnasium environments of others: two roads of it.
 
-The ego is put where its plan has it, along the middle of its lane (kinematically, at
-10 Hz); it never changes lanes. The others are highway-env's IDMVehicles, which do, and
-react to the ego. The own driver is an IDMVehicle in the ego's place: one that keeps its
-lane, as ours do, and one that overtakes.
+The ego is put where its plan has it (kinematically, at 10 Hz): along the middle of its
+lane or, where paths are planned, beside it and in the lanes that go on as its own does.
+The others are highway-env's IDMVehicles, which change lanes and react to the ego. The
+own driver is an IDMVehicle in the ego's place: one that keeps its lane, and one that
+overtakes.
 """
 
 import math
@@ -70,6 +71,7 @@ class HighwayEnv:
     name = "highway_env"
     own_drivers = (KEEPS, CHANGES)
     together = 25
+    changes_lanes = True
 
     def episodes(self, count: int, seed: int) -> list[str]:
         """Return KIND/SEED/NUMBER, the kinds in turn."""
@@ -100,15 +102,41 @@ class HighwayEpisode:
         self.road.vehicles[self.road.vehicles.index(theirs)] = self.ego
         self._lane, self._driven = self.ego.lane_index, 0.0
         self._station, _ = self.way().project(*self.ego.position)
+        self._aside, self._curvature = 0.0, 0.0
 
     def way(self) -> Way:
         """Return the way along the ego's lane and those that follow it."""
         if self._lane not in self._ways:
             lane = self.road.network.get_lane(self._lane)
+            beside = self._lanes_beside()
+            width = lane.width_at(0.0)
             self._ways[self._lane] = Way(
-                self._points(self._lane), lane.speed_limit, lane.width_at(0.0)
+                self._points(self._lane),
+                lane.speed_limit,
+                width,
+                left=(0.5 + sum(l > 0.0 for l in beside)) * width,
+                right=(0.5 + sum(l < 0.0 for l in beside)) * width,
             )
         return self._ways[self._lane]
+
+    def _lanes_beside(self) -> dict[float, tuple]:
+        """Return the other lanes that go on as the ego's does, by offset m to the left.
+
+        Lanes of one direction have the same two nodes; one that ends, as a ramp's, is
+        missing in a road further on.
+        """
+        network, (begin, end, own) = self.road.network, self._lane
+        count, road = len(network.graph[begin][end]), (begin, end)
+        while road[1] in network.graph:
+            road = road[1], next(iter(network.graph[road[1]]))
+            count = min(count, len(network.graph[road[0]][road[1]]))
+        here = network.get_lane(self._lane)
+        s = here.local_coordinates(self.ego.position)[0]
+        found = {}
+        for n in set(range(count)) - {own}:
+            place = network.get_lane((begin, end, n)).position(s, 0.0)
+            found[float(here.local_coordinates(place)[1])] = (begin, end, n)
+        return found
 
     def _points(self, index: tuple) -> np.ndarray:
         """Return points of a lane and of its followers, straight beyond the last."""
@@ -145,20 +173,26 @@ class HighwayEpisode:
                 acceleration=float(action.get("acceleration", 0.0)),
                 length=float(ego.LENGTH),
                 width=float(ego.WIDTH),
+                curvature=self._curvature,
             ),
             centre_line=way.centre_line,
             obstacles=[_body(other) for other in near],
             way=self._driven,
             speed_limit=way.limit(0.0),
+            aside=self._aside,
         )
 
     def step(self, move: Move | None) -> None:
-        """Advance 0.1 s, the ego along its line or as its own driver drives."""
+        """Advance 0.1 s, the ego by its move or as its own driver drives."""
         before = np.array(self.ego.position)
+        self._aside = 0.0
         if move is not None:
             self._station += move.way
-            x, y, heading, _ = self.way().place(self._station)
+            way = self.way().beside(self._station, move.beside)
+            x, y, heading, self._curvature = way
             self.ego.put(x, y, heading, move)
+            if move.beside is not None:
+                self._change_lane(move.beside[0])
         self.road.act()
         self.road.step(STEP_S)
         if move is not None:
@@ -166,6 +200,14 @@ class HighwayEpisode:
         else:
             self._lane = self.ego.lane_index
             self._driven += math.hypot(*(self.ego.position - before))
+
+    def _change_lane(self, l: float) -> None:
+        """Take the lane whose middle is nearest to an offset m as the ego's."""
+        lanes = {0.0: self._lane, **self._lanes_beside()}
+        self._aside = min(lanes, key=lambda middle: abs(l - middle))
+        if self._aside:
+            self._lane = lanes[self._aside]
+            self._station, _ = self.way().project(*self.ego.position)
 
     def close(self) -> None:
         """Close the environment."""

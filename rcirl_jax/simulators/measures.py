@@ -20,7 +20,8 @@ from rcirl_jax.simulation.world import STOPPED_EGO_MPS
 from rcirl_jax.simulators.simulators import STEP_S, View
 
 LENGTHS = 100  # steps: records are filled up to a multiple, so that few compile
-EpisodeLog = dict[str, np.ndarray]  # [S] by leaf of `simulation.cases.Record`
+# [S] by leaf of `simulation.cases.Record`, and `changes_lane`
+EpisodeLog = dict[str, np.ndarray]
 # leaves after a drive's end and where nobody logs them; the others are 0
 FAR = dict.fromkeys(("clearance", "ttc", "headway", "free_way"), math.inf)
 REST = {"speed_limit": 1.0, **FAR}
@@ -83,7 +84,7 @@ def _against(ego: Car, body: Body) -> Contact | None:
 def sample(
     view: View, after: View, gap: float, gap_speed: float, line: float, fallback: bool
 ) -> dict[str, float]:
-    """Return the record of one step, by leaf of `EpisodeLog`.
+    """Return the record of one step, by key of `EpisodeLog`.
 
     Args:
       view: before the step.
@@ -113,6 +114,7 @@ def sample(
         "impact_speed": hit.relative_speed if hit else 0.0,
         "red_light": after.passed_red > 0,
         "fallback": fallback,
+        "changes_lane": after.aside != 0.0,
     }
 
 

@@ -19,7 +19,7 @@ from scipy.interpolate import CubicHermiteSpline
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.export.own_planner.inputs import STATES, Body, Car, Signal
-from rcirl_jax.simulators.drive import Driver, Seen
+from rcirl_jax.simulators.drive import Driver, Seen, refuse_paths
 from rcirl_jax.simulators.simulators import STEP_S, Move, View, Way
 from rcirl_jax.units import HORIZON_S
 
@@ -61,6 +61,7 @@ class Planner:
 
     def __init__(self, weights: str, seed: int, theirs: SimpleNamespace) -> None:
         self._row, self._seed, self._theirs = table_rows([weights], [])[0], seed, theirs
+        refuse_paths(self._row, "nuPlan")
 
     def name(self) -> str:
         """Return the planner's name."""
@@ -96,7 +97,7 @@ class Planner:
         way = self._way or self._line(ego.center)
         view = self._view(way, ego, observation, current_input.traffic_light_data)
         scenes, _ = self._seen.scenes([view])
-        (move,), _ = self._driver.moves(scenes)
+        (move,), _ = self._driver.moves(scenes, np.zeros(1, np.float32))
         return self._trajectory(way, ego, move)
 
     def _line(self, place: Any) -> Way:  # noqa: ANN401

@@ -18,6 +18,7 @@ import numpy as np
 
 from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.export.own_planner.inputs import Body, Car, CentreLine, Signal
+from rcirl_jax.features.columns import path_curvature
 from rcirl_jax.geometry.frenet import reference_line_from_polyline
 from rcirl_jax.planner.plan import COMMAND_STEP_S
 from rcirl_jax.units import STATION_STEP_M
@@ -42,6 +43,9 @@ class View:
     way: float  # m that the ego has driven since the first view
     speed_limit: float  # m/s, posted, where the ego is
     passed_red: int = 0  # stop lines passed against a red light since the last view
+    # m, how far the centre line lies to the left of that of the view before: it is
+    # another one where the ego has changed lanes
+    aside: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -56,6 +60,9 @@ class Move:
     speed: float  # m/s at its end
     acceleration: float  # m/s^2 at its end
     future: np.ndarray  # [18, 3] the plan from now on: t s, way m, speed m/s
+    # where paths are planned: offset m to the left of the centre line, its slope 1 and
+    # second derivative 1/m by station, at the end
+    beside: tuple[float, float, float] | None = None
 
 
 class Running(Protocol):
@@ -81,6 +88,7 @@ class Simulator(Protocol):
     # its own ways to drive the ego, the first being the one to compare with
     own_drivers: tuple[str, ...]
     together: int  # episodes that run in lock step at most
+    changes_lanes: bool  # its egos may leave the middle of their lane
 
     def episodes(self, count: int, seed: int) -> list[str]:
         """Return names of different episodes, KIND/NUMBER; a name says all of it."""
@@ -143,10 +151,18 @@ class Way:
       points: [m, 2] m, in driving direction.
       speed_limit: m/s, one, or one for each point from which it holds.
       lane_width: m.
+      left: m from the middle to the left edge of the lanes that may be driven on; None:
+        of this lane.
+      right: m to their right edge.
     """
 
     def __init__(
-        self, points: np.ndarray, speed_limit: float | np.ndarray, lane_width: float
+        self,
+        points: np.ndarray,
+        speed_limit: float | np.ndarray,
+        lane_width: float,
+        left: float | None = None,
+        right: float | None = None,
     ) -> None:
         points = np.asarray(points, float)
         arc = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
@@ -166,6 +182,8 @@ class Way:
             points=np.stack([self._x, self._y], axis=1),
             speed_limit=self.limits,
             lane_width=lane_width,
+            road_left=left,
+            road_right=right,
         )
 
     def place(
@@ -191,6 +209,27 @@ class Way:
             y + left * math.cos(heading),
             heading + math.atan(-left / FADING_M),
             kappa,
+        )
+
+    def beside(
+        self, s: float, planned: tuple[float, float, float] | None
+    ) -> tuple[float, float, float, float]:
+        """Return (x, y) m, heading rad and curvature 1/m of a car beside the line.
+
+        Args:
+          s: m, station.
+          planned: `Move.beside`; None: on the line.
+        """
+        x, y, heading, kappa = self.place(s)
+        if planned is None:
+            return x, y, heading, kappa
+        l, dl, ddl = planned
+        shrink = max(1.0 - kappa * l, 0.1)
+        return (
+            x - l * math.sin(heading),
+            y + l * math.cos(heading),
+            heading + math.atan(dl / shrink),
+            float(path_curvature(np.float64(kappa), np.zeros(()), l, dl, ddl)),
         )
 
     def project(self, x: float, y: float) -> tuple[float, float]:

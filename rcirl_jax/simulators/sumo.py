@@ -10,10 +10,11 @@ A main road crosses junctions with lights or, without lights, with the right of 
 
 libsumo holds one simulation a process, so the episodes of a run are corridors side by
 side that no vehicle leaves; ids begin with the corridor's number: `3.m1`. The ego
-drives along the middle of its lane, straight on at every junction, with all of SUMO's
-checks of its speed and its lane changes off: what it does at lights and behind others
-is the planner's alone. The own driver is SUMO's Krauss model with its default numbers,
-in the same lane.
+drives straight on at every junction, with all of SUMO's checks of its speed and its
+lane changes off: what it does at lights and behind others is the planner's alone. It
+drives along the middle of its lane or, where paths are planned, beside it: SUMO has it
+in the lane that its centre is on. The own driver is SUMO's Krauss model with its
+default numbers, in the first lane.
 """
 
 import dataclasses
@@ -92,6 +93,7 @@ class Sumo:
     name = "sumo"
     own_drivers = (KRAUSS,)
     together = 25
+    changes_lanes = True
 
     def episodes(self, count: int, seed: int) -> list[str]:
         """Return KIND/SEED/NUMBER; traffic depends on who runs beside it."""
@@ -209,31 +211,41 @@ class Ego:
 
     def __init__(self, name: str, number: int, own: str | None) -> None:
         self.name, self._own = name, own
-        self._begins, self._way = _lanes(_main_road(number))
+        self._ways = _ways(_main_road(number))
+        self._lane = 0
+        self._beside: tuple[float, float, float] | None = None
         self._size = (libsumo.vehicle.getLength(name), libsumo.vehicle.getWidth(name))
         self._acceleration = 0.0
-        self._start = self._front()
+        self._start, self._driven = self._front(), 0.0
         self._next = self._light()
-        self._halts: set[tuple[str, int]] = set()  # lights that it stops for
+        self._halts: set[str] = set()  # lights that it stops for
         if own is None:
             libsumo.vehicle.setSpeedMode(name, FREE)
 
     def go(self, move: Move) -> None:
-        """Set the speed at the end of the next step."""
+        """Set the speed at the end of the next step, and the lane that it is on."""
         libsumo.vehicle.setSpeed(self.name, move.speed)
-        self._acceleration = move.acceleration
+        self._acceleration, self._beside = move.acceleration, move.beside
+        if move.beside is None:
+            return
+        # lanes are counted from the right
+        lane = self._lane + round(move.beside[0] / self._width)
+        lane = min(max(lane, 0), len(self._ways) - 1)
+        if lane != self._lane:
+            libsumo.vehicle.changeLane(self.name, lane, STEP_S)
 
     def look(self, others: Sequence[Body]) -> View | None:
         """Return what is seen; None: the way ends within the planner's horizon."""
-        get, front = libsumo.vehicle, self._front()
-        length, width = self._size
-        if front + MOST_MPS * HORIZON_S > self._way.stations[-1]:
+        get, aside, length = libsumo.vehicle, self._changed(), self._size[0]
+        front, way = self._front(), self._ways[self._lane][1]
+        if front + MOST_MPS * HORIZON_S > way.stations[-1]:
             return None
-        x, y, heading, curvature = self._way.place(front - 0.5 * length)
+        self._driven = front - self._start
+        x, y, heading, curvature = way.beside(front - 0.5 * length, self._beside)
         own = get.getAcceleration(self.name)
         before, self._next = self._next, self._light()
         passed_red = False
-        if before is not None and before != self._next:
+        if before is not None and before[0] != (self._next or ("",))[0]:
             shows = libsumo.trafficlight.getRedYellowGreenState(before[0])[before[1]]
             passed_red = STATES.get(shows) == "red"
         return View(
@@ -245,20 +257,40 @@ class Ego:
                 acceleration=self._acceleration if self._own is None else own,
                 curvature=curvature,
                 length=length,
-                width=width,
+                width=self._size[1],
             ),
-            centre_line=self._way.centre_line,
+            centre_line=way.centre_line,
             obstacles=others,
             signals=self._signals(front),
-            way=front - self._start,
-            speed_limit=self._way.limit(front),
+            way=self._driven,
+            speed_limit=way.limit(front),
             passed_red=int(passed_red),
+            aside=aside,
         )
+
+    @property
+    def _width(self) -> float:
+        """The width m of a lane."""
+        return self._ways[0][1].centre_line.lane_width
+
+    def _changed(self) -> float:
+        """Take the lane that SUMO has the ego on; return how far m left it lies."""
+        at = libsumo.vehicle.getLaneID(self.name)
+        begins = [at in begins for begins, _ in self._ways]
+        lane = begins.index(True) if any(begins) else self._lane
+        aside, self._lane = (lane - self._lane) * self._width, lane
+        if aside and self._beside is not None:
+            step = libsumo.vehicle.getSpeed(self.name) * STEP_S
+            self._start = self._front() - self._driven - step
+            l, dl, ddl = self._beside
+            self._beside = (l - aside, dl, ddl)
+        return aside
 
     def _front(self) -> float:
         """Return the station m of the front bumper."""
         lane = libsumo.vehicle.getLaneID(self.name)
-        return self._begins[lane] + libsumo.vehicle.getLanePosition(self.name)
+        begins, _ = self._ways[self._lane]
+        return begins[lane] + libsumo.vehicle.getLanePosition(self.name)
 
     def _light(self) -> tuple[str, int] | None:
         """Return the next light and which of its links the ego takes."""
@@ -273,37 +305,54 @@ class Ego:
         let go on.
         """
         found, halts = [], set()
+        way = self._ways[self._lane][1]
         speed = libsumo.vehicle.getSpeed(self.name)
-        for *light, distance, shown in libsumo.vehicle.getNextTLS(self.name):
-            link, state = tuple(light), STATES.get(shown, "green")
-            halt = state == "red" or link in self._halts or can_stop(speed, distance)
+        for light, _, distance, shown in libsumo.vehicle.getNextTLS(self.name):
+            state = STATES.get(shown, "green")
+            halt = state == "red" or light in self._halts or can_stop(speed, distance)
             if halt and state != "green":
-                halts.add(link)
+                halts.add(light)
                 state = "red"
             if distance < SIGNAL_M:
-                x, y, *_ = self._way.place(front + distance)
+                x, y, *_ = way.place(front + distance)
                 found.append(Signal(x=x, y=y, state=state))
         self._halts = halts
         return found
 
 
-def _lanes(edges: Sequence[str]) -> tuple[dict[str, float], Way]:
-    """Return stations m where a way's lanes begin, and the way: lane 0 of each edge."""
-    begins, points, limits, station = {}, [], [], 0.0
-    for edge, after in zip(edges, [*edges[1:], None], strict=True):
-        parts = [f"{edge}_0"]
-        links = [x for x in libsumo.lane.getLinks(parts[0]) if x[0] == f"{after}_0"]
-        while links and (part := links[0][4]):  # a lane across the junction
-            parts.append(part)
-            links = libsumo.lane.getLinks(part)
-        for part in parts:
-            shape = np.array(libsumo.lane.getShape(part))
-            begins[part] = station
-            station += float(np.sum(np.hypot(*np.diff(shape, axis=0).T)))
-            points.append(shape)
-            limits += [libsumo.lane.getMaxSpeed(part)] * len(shape)
+def _ways(edges: Sequence[str]) -> list[tuple[dict[str, float], Way]]:
+    """Return the lanes that go straight on along all edges, from the right.
+
+    Of each, the stations m where its parts begin, by lane of SUMO, and the way.
+    """
     width = libsumo.lane.getWidth(f"{edges[0]}_0")
-    return begins, Way(np.concatenate(points), np.array(limits), width)
+    found = []
+    for lane in range(libsumo.edge.getLaneNumber(edges[0])):
+        begins, points, limits, station = {}, [], [], 0.0
+        for edge, after in zip(edges, [*edges[1:], None], strict=True):
+            part = f"{edge}_{lane}"
+            while part:  # a lane, and those across the junction behind it
+                shape = np.array(libsumo.lane.getShape(part))
+                begins[part] = station
+                station += float(np.sum(np.hypot(*np.diff(shape, axis=0).T)))
+                points.append(shape)
+                limits += [libsumo.lane.getMaxSpeed(part)] * len(shape)
+                links = libsumo.lane.getLinks(part)
+                part = next((x[4] for x in links if x[0] == f"{after}_{lane}"), "")
+        found.append((begins, np.concatenate(points), np.array(limits)))
+    return [
+        (
+            begins,
+            Way(
+                points,
+                limits,
+                width,
+                left=(len(found) - lane - 0.5) * width,
+                right=(lane + 0.5) * width,
+            ),
+        )
+        for lane, (begins, points, limits) in enumerate(found)
+    ]
 
 
 # ------------------------------------------------------- the files that SUMO reads

@@ -33,6 +33,7 @@ MEANS = {
     "min_a": "min a m/s2",
     "standing_share": "standing",
     "fallback_share": "fallback",
+    "lane_changes": "lane changes",
 }
 # yes or no of an episode
 RATES = {
@@ -55,7 +56,9 @@ def numbers_of(logs: Mapping[str, EpisodeLog]) -> dict[str, Numbers]:
         return {}
     found = measure(list(logs.values()))
     holds = dict(zip(COLUMNS, found.holds.T, strict=True))
-    columns = {key: getattr(found, key) for key in MEANS} | {
+    changes = [np.sum(log["changes_lane"]) for log in logs.values()]
+    columns = {key: getattr(found, key) for key in MEANS if key != "lane_changes"} | {
+        "lane_changes": changes,
         "at_fault": found.at_fault > 0,
         "collisions": found.collisions > 0,
         "red_lights": found.red_lights > 0,

@@ -12,6 +12,7 @@ class Straight:
     name = "straight"
     own_drivers = ("keeps 10 m/s",)
     together = 3
+    changes_lanes = False
 
     def __init__(self, signals=()):
         self.signals = signals

@@ -12,7 +12,7 @@ from rcirl_jax.planner.plan import held
 from rcirl_jax.planner.rank import RankConfig
 from rcirl_jax.simulation.rows import Row, baseline_row
 from rcirl_jax.simulation.world import Vehicle
-from rcirl_jax.simulators.drive import Seen, drive, follow
+from rcirl_jax.simulators.drive import Driver, Seen, drive, follow
 from rcirl_jax.simulators.measures import measure
 from rcirl_jax.simulators.table import (
     numbers_of,
@@ -21,6 +21,7 @@ from rcirl_jax.simulators.table import (
     text_of,
     write_results,
 )
+from rcirl_jax.units import TIMES_S
 from tests.simulators.straight import Straight, red_light
 
 
@@ -117,6 +118,39 @@ def test_a_step_is_that_of_our_own_drive_train():
     np.testing.assert_allclose(made.future[0], [0.0, 0.0, 10.0], atol=1e-5)
     assert float(made.future[-1, 1]) == pytest.approx(25.0, abs=0.2)  # 10^2 / 4
     assert float(made.future[-1, 2]) == pytest.approx(0.0, abs=1e-5)
+
+
+def test_a_plan_with_a_path_says_how_far_beside_its_line_the_ego_is():
+    l = 0.5 * jnp.asarray(TIMES_S)  # m, to the left, at 10 m/s
+    path = jnp.stack([l, jnp.full_like(l, 0.05), jnp.zeros_like(l)])
+    plan = held(jnp.asarray(10.0), jnp.asarray(0.0)).replace(path=path)
+    made = follow(plan, 10.0, 0.0, Vehicle())
+    np.testing.assert_allclose(made.beside, [0.05, 0.05, 0.0], atol=1e-6)
+    made = follow(plan.replace(since=jnp.asarray(2.0)), 10.0, 0.0, Vehicle())
+    np.testing.assert_allclose(made.beside, [1.05, 0.05, 0.0], atol=1e-6)
+
+
+def keeps_its_plan(params, scene, key, before=None):
+    return before
+
+
+vars(keeps_its_plan)["steers"] = True
+STEERS = Row(name="steers", policy=keeps_its_plan)
+
+
+def test_a_plan_is_kept_where_the_centre_line_is_another_lanes():
+    scenes, _ = Seen(2).scenes(Straight().start(["0/0/0000", "5/0/0001"], None).look())
+    driver = Driver(STEERS, [0, 0])
+    asked = []
+    for aside in ([0.0, 0.0], [3.5, 0.0], [0.0, -3.5]):
+        moves, _ = driver.moves(scenes, np.asarray(aside, np.float32))
+        asked.append([move.beside[0] for move in moves])
+    assert asked == [[0.0, 0.0], [-3.5, 0.0], [-3.5, 3.5]]
+
+
+def test_paths_are_refused_where_egos_keep_their_lane():
+    with pytest.raises(InputError, match=r"steers: mode: path_speed: .* in straight"):
+        drive(Straight(), STEERS, ["0/0/0000"], 1.0)
 
 
 def test_a_table_has_a_row_per_driver_and_paired_differences(driven):

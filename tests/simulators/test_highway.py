@@ -5,13 +5,17 @@ import pytest
 
 highway = pytest.importorskip("rcirl_jax.simulators.highway")
 
+from highway_env.envs import MergeEnv  # noqa: E402
+
 from rcirl_jax.simulators.drive import Seen  # noqa: E402
 from rcirl_jax.simulators.simulators import Move  # noqa: E402
 
 
-def move(way, speed, acceleration=0.0):
+def move(way, speed, acceleration=0.0, beside=None):
     future = np.zeros((18, 3), np.float32)
-    return Move(way=way, speed=speed, acceleration=acceleration, future=future)
+    return Move(
+        way=way, speed=speed, acceleration=acceleration, future=future, beside=beside
+    )
 
 
 @pytest.fixture(params=["dense/3/0001", "merge/0/0002"])
@@ -64,6 +68,41 @@ def test_a_move_puts_the_ego_where_it_says(episode):
     assert after.ego.y == pytest.approx(before.ego.y, abs=1e-3)
     assert (after.ego.speed, after.ego.acceleration) == (26.0, 1.0)
     assert after.centre_line is before.centre_line
+
+
+def test_only_lanes_that_go_on_may_be_driven_on(episode):
+    """highway-v0 has lanes at y = 0, 4, 8 m and so on; merge-v1 two, and a ramp's."""
+    line = episode.look().centre_line
+    others = 2 if isinstance(episode.env, MergeEnv) else 3
+    lane = episode.ego.lane_index[2]
+    edges = ((others - 0.5 - lane) * 4.0, (0.5 + lane) * 4.0)
+    assert (line.road_left, line.road_right) == edges
+
+
+def test_a_planned_path_leads_into_the_next_lane(episode):
+    """To the lane at smaller y, 0.2 m in every 2 m: the frame becomes that lane's."""
+    begins, start = episode.look(), np.array(episode.ego.position)
+    lane, offset, asides = episode.ego.lane_index[2], 0.0, []
+    assert lane == 1
+    for _ in range(20):
+        offset -= 0.2
+        episode.step(move(2.0, 20.0, beside=(offset, -0.1, 0.001)))
+        view = episode.look()
+        asides.append(view.aside)
+        offset -= view.aside
+        assert view.ego.heading == pytest.approx(-np.arctan(0.1))
+        assert view.ego.curvature == pytest.approx(0.001, rel=0.02)
+    assert [x for x in asides if x] == [-4.0]
+    assert asides.index(-4.0) == 10  # behind the line between both
+    assert offset == pytest.approx(0.0, abs=1e-9)
+    moved = np.array(episode.ego.position) - start
+    np.testing.assert_allclose(moved, [40.0, -4.0], atol=0.02)
+    assert episode.ego.lane_index[2] == 0
+    assert view.way == pytest.approx(40.0)
+    assert view.centre_line is not begins.centre_line
+    scene, _ = Seen(1).scenes([view])
+    assert float(scene.ego.l[0]) == pytest.approx(0.0, abs=0.02)
+    assert float(scene.ego.dl[0]) == pytest.approx(-0.1, abs=2e-3)
 
 
 @pytest.mark.parametrize("own", highway.HighwayEnv.own_drivers)

@@ -16,11 +16,13 @@ from rcirl_jax.simulators.sumo import KRAUSS, Sumo
 NAMES = ["dense/0/0000", "single/0/0001", "sparse/0/0002"]
 
 
-def move(view, acceleration=0.0):
+def move(view, acceleration=0.0, beside=None):
     speed = max(view.ego.speed + 0.1 * acceleration, 0.0)
     way = 0.05 * (view.ego.speed + speed)
     future = np.zeros((18, 3), np.float32)
-    return Move(way=way, speed=speed, acceleration=acceleration, future=future)
+    return Move(
+        way=way, speed=speed, acceleration=acceleration, future=future, beside=beside
+    )
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +91,40 @@ def test_a_move_is_what_the_ego_does(corridors):
         assert now.way - then.way == pytest.approx(asked.way, abs=1e-2)
         assert now.ego.acceleration == -1.0
         assert now.centre_line is then.centre_line
+
+
+def test_a_planned_path_leads_into_the_lane_beside(corridors):
+    """0.3 m to the left in every step: SUMO has the ego there, the frame follows."""
+    before = corridors.look()
+    width = before[0].centre_line.lane_width
+    edges = [x.centre_line.road_left / width for x in before]
+    assert edges == pytest.approx([1.5, 0.5, 1.5])
+    offsets, asides, driven = [0.0, 0.0, 0.0], [[], [], []], [0.0, 0.0, 0.0]
+    steps = int(width / 0.3)
+    for _ in range(steps):
+        views = corridors.look()
+        offsets = [l + 0.3 * (n != 1) for n, l in enumerate(offsets)]
+        moves = [
+            move(view, beside=(l, 0.3 / 1.5, 0.0))
+            for view, l in zip(views, offsets, strict=True)
+        ]
+        corridors.step(moves)
+        for n, view in enumerate(corridors.look()):
+            driven[n] += moves[n].way
+            offsets[n] -= view.aside
+            asides[n] += [view.aside] if view.aside else []
+            x, y = libsumo.vehicle.getPosition(f"{n}.ego")
+            assert math.hypot(view.ego.x - x, view.ego.y - y) < 5.0
+    assert asides == [[width], [], [width]]
+    for n, (then, now) in enumerate(zip(before, corridors.look(), strict=True)):
+        lane = libsumo.vehicle.getLaneID(f"{n}.ego")
+        assert lane.endswith("_0" if n == 1 else "_1")
+        assert now.way - then.way == pytest.approx(driven[n], abs=0.1)
+        assert (now.centre_line is then.centre_line) == (n == 1)
+        left = 0.5 * width
+        assert now.centre_line.road_left == left
+        scenes, _ = Seen(3).scenes(corridors.look())
+        assert float(scenes.ego.l[n]) == pytest.approx(offsets[n], abs=0.05)
 
 
 def test_yellow_stays_red_for_who_could_stop_when_it_began():
