@@ -174,6 +174,15 @@ COMMANDS = (
         {"gains": "suite.json"},
         after="chain",
     ),
+    Command(
+        "verdict_gain_1",  # twice the recipe's gain
+        60,
+        "rcirl_jax gate --candidate={after}/dials/2.msgpack --incumbent=hand-set "
+        "--tuned_idm={after}/tuned_idm.json --data={us101},{urban},{i80} --workers=2 "
+        "--output={out}/verdict.json",
+        {"verdict_gain_1": "verdict.json"},
+        after="chain",
+    ),
     *(
         Command(
             f"elsewhere_{name}",
