@@ -18,7 +18,7 @@ from rcirl_jax.simulation.cases import EgoState
 from rcirl_jax.simulation.rollout import first_scenes
 from rcirl_jax.simulation.rows import baseline_row
 from rcirl_jax.simulation.world import Vehicle, drive, lane_centre
-from rcirl_jax.simulators.drive import Driver
+from rcirl_jax.simulators.drive import refuse_paths
 from rcirl_jax.units import STATION_STEP_M
 from tests.helpers.own_planner import drawn_reward
 from tests.simulation.drives import drive as drive_all
@@ -116,5 +116,5 @@ def test_weights_plan_what_they_were_trained_to_plan(tmp_path):
     assert steers() == [True, True, False, False]
     assert steers(mode="speed") == [True, False, False, False]
     assert steers(dp=True) == [True, True, True, True, False, False]
-    with pytest.raises(InputError, match=r"mode: path_speed: .* in other simulators"):
-        Driver(ROW, [0])
+    with pytest.raises(InputError, match=r"mode: path_speed: .* in nuPlan rows of ours"):
+        refuse_paths(ROW, "nuPlan")

@@ -259,7 +259,8 @@ inline std::size_t Reward::total(const float* features, std::size_t count, Mask 
       const bool known = !begins || detail::knows(network, features + (first + k) * row);
       const double added = gain() * static_cast<double>(value);
       // a value that was refused stays so, whether it counts or not
-      const double sum = static_cast<double>(own[k]) + (known || value == kNone ? added : 0.0);
+      const bool counts = known || std::isinf(value);
+      const double sum = static_cast<double>(own[k]) + (counts ? added : 0.0);
       const bool finite = std::abs(sum) <= double{std::numeric_limits<float>::max()};
       value = finite ? static_cast<float>(sum) : kNone;
       refused += !finite;
