@@ -116,5 +116,5 @@ def test_weights_plan_what_they_were_trained_to_plan(tmp_path):
     assert steers() == [True, True, False, False]
     assert steers(mode="speed") == [True, False, False, False]
     assert steers(dp=True) == [True, True, True, True, False, False]
-    with pytest.raises(InputError, match=r"mode: path_speed: .* in nuPlan rows of ours"):
+    with pytest.raises(InputError, match=r"mode: path_speed: .* in nuPlan rows"):
         refuse_paths(ROW, "nuPlan")
