@@ -65,6 +65,7 @@ from rcirl_jax.planner.rank import (
     RankConfig,
     Ranking,
     best_plan,
+    gain_in,
     learned_score,
     ranking_score,
     with_plan_in_force,
@@ -77,7 +78,6 @@ from rcirl_jax.reward.network import (
     layers_of,
     matmul_f32,
 )
-from rcirl_jax.reward.normaliser import supported
 from rcirl_jax.reward.time_sums import TIME_SUMS, Grid, TimeSum
 from rcirl_jax.sampling import sample
 from rcirl_jax.sampling.kinematics import (
@@ -222,9 +222,6 @@ def make_lattice(
         v=ego.v.at[0].set(scene.ego.v), a=ego.a.at[0].set(scene.ego.a), j=ego.j * 0.0
     )
     valid = scene.time_valid
-    first_row, gain = features(scene, start)[0], jnp.asarray(objective.gain)
-    if objective.own != "constant V":
-        gain = jnp.where(supported(weights[1], first_row), gain, 0.0)
     blocked = _blocked(scene, config)
     grid = Grid(
         stations,
@@ -243,8 +240,8 @@ def make_lattice(
         blocked_after=blocked[1::2],
         speed_cap=_speed_cap(scene, stations, config),
         first=jax.tree.map(lambda x: x[0], start),
-        first_row=first_row,
-        weight=jnp.where(valid, gain / unit * weights[0]["gamma"], 0.0),
+        first_row=features(scene, start)[0],
+        weight=jnp.where(valid, objective.gain / unit * weights[0]["gamma"], 0.0),
         own=own.replace(**scaled),
         unit=unit,
         has_next=jnp.concatenate([valid[1:], jnp.zeros((1,), bool)]),
@@ -785,7 +782,7 @@ def dp_policy(
         reference = jax.tree.map(lambda x: x[best], sampled.trajectory)
         on_path = along(scene, reference) if rank.steers else scene
         objective = Objective(
-            gain=params.gain,
+            gain=gain_in(params, features(scene, reference)[0]),
             reference=reference,
             own=own,
         )

@@ -232,6 +232,18 @@ def ranking(
     )
 
 
+def gain_in(params: Ranking, first: jax.Array) -> jax.Array:
+    """Returns the gain [] in a scene: 0 where V does not know it, unless V is alone.
+
+    Args:
+      params: the ranking.
+      first: [F], raw features of one trajectory at t = 0.
+    """
+    alone = params.own == list(OWN_SCORES).index("constant V")
+    counts = alone | supported(params.normaliser, first)
+    return jnp.where(counts, params.gain, 0.0)
+
+
 @functools.lru_cache(maxsize=16)
 def ranking_score(
     features: FeatureMap, activation: str, user: OwnCost | None = None
@@ -247,9 +259,8 @@ def ranking_score(
         model = effective_model(params.reward, activation)
         values = value_rows(model, params.reward, params.normaliser, rows, scene)
         first = jnp.stack([row[0, 0] for row in rows])  # as for the gates
-        alone = params.own == list(OWN_SCORES).index("constant V")
-        counts = alone | supported(params.normaliser, first)
-        return jnp.where(counts, params.gain * values, 0.0)
+        gain = gain_in(params, first)
+        return jnp.where(gain == 0.0, 0.0, gain * values)
 
     def score(params: Ranking, scene: Scene, candidates: Candidates) -> jax.Array:
         seen = scene, candidates

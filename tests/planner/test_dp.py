@@ -15,12 +15,14 @@ from rcirl_jax.planner.dp import (
     DpConfig,
     Objective,
     backward,
+    dp_policy,
     make_lattice,
     make_layers,
     search,
     smoothed,
 )
 from rcirl_jax.planner.rank import (
+    RankConfig,
     learned_score,
     ranking,
     ranking_score,
@@ -206,22 +208,27 @@ def test_an_own_cost_that_is_a_sum_is_searched_exactly(own):
     assert found >= 2
 
 
-def test_a_search_is_by_the_own_cost_where_v_does_not_know_the_scene():
+def test_a_search_is_by_the_own_cost_where_v_does_not_know_the_scene(monkeypatch):
+    """A speed that never varied in training: as it is now, and 1.1 scales away."""
     made = scene_of(0)
     params, norm = weights(0)
-    at = FEATURES.names.index("velocity")
-    elsewhere = norm.location.at[at].set(float(made.ego.v) + 1.1 * norm.scale[at])
-    values = {}
-    for name, end in (("known", norm.upper), ("new", norm.lower.at[at].set(99.0))):
-        w = params, norm.replace(location=elsewhere, lower=end - 1.0, upper=end)
-        if name == "new":
-            w = params, w[1].replace(lower=end)
-        values[name] = [
-            float(best(made, w, COARSE, gain=gain, own="+velocity").value)
-            for gain in (0.0, 3.0)
-        ]
-    assert values["new"][0] == values["new"][1]
-    assert values["known"][0] != values["known"][1]
+    at, gains = FEATURES.names.index("velocity"), []
+
+    def found(scene, w, features, activation, config, objective):
+        gains.append(float(objective.gain))
+        raise StopIteration
+
+    monkeypatch.setattr("rcirl_jax.planner.dp.search", found)
+    for own in ("+velocity", "constant V"):
+        policy = dp_policy(FEATURES, SHAPE.activation, RankConfig(), COARSE, own)
+        for off in (0.0, 1.1):
+            usual = norm.location.at[at].set(made.ego.v + off * norm.scale[at])
+            empty = {x: getattr(norm, x).at[at].set(1.0) for x in ("lower", "upper")}
+            w = params, norm.replace(location=usual, **empty)
+            searching = ranking(w, own, 3.0), jnp.asarray(False)
+            with jax.disable_jit(), pytest.raises(StopIteration):
+                policy(searching, made, jax.random.key(0))
+    assert gains == [3.0, 0.0, 3.0, 3.0]
 
 
 def test_ratios_are_linear_about_the_reference():
