@@ -14,12 +14,15 @@ RESULTS ?= benchmarks/results
 # folder of the locked versions; `LOCK=` takes the newest that pyproject.toml allows
 LOCK ?= requirements
 PIP := -m pip --quiet --disable-pip-version-check
+# most of what is installed is never imported: Python compiles the rest when it first is, and keeps it
+INSTALL := $(PIP) install --no-compile
+unexport PYTHONDONTWRITEBYTECODE
 
 # $(call install,VENV,EXTRA): what EXTRA needs, each file by its hash, then the project
 install = $(if $(LOCK),\
-  $(1)/bin/python $(PIP) install --requirement $(LOCK)/$(2).lock --require-hashes && \
-  $(1)/bin/python $(PIP) install --no-deps --no-build-isolation --editable .,\
-  $(1)/bin/python $(PIP) install --editable '.[$(2)]')
+  $(1)/bin/python $(INSTALL) --requirement $(LOCK)/$(2).lock --require-hashes && \
+  $(1)/bin/python $(INSTALL) --no-deps --no-build-isolation --editable .,\
+  $(1)/bin/python $(INSTALL) --editable '.[$(2)]')
 
 # Minutes; they touch every dependency: logs, store, two epochs, resume, export, readers, pages
 QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_writes_what_it_should \
@@ -33,8 +36,6 @@ QUICKLY = -m pytest -q -m "not slow and not dataset" $(QUICK)
 # with other versions: compiled quickly, and no files of damaged bytes
 OTHERS = XLA_FLAGS="--xla_backend_optimization_level=0 $(XLA_FLAGS)"
 UNDAMAGED = -k "not changed_bytes and not damaged_files"
-# an environment that is used once: what is never imported need not be compiled
-ONCE := $(PIP) install --no-compile
 
 # Features, gradients, resume, recordings, and what rounds otherwise when compiled quickly, with
 # the compiler as users have it. For the rest XLA compiles in half the time to slower programs;
@@ -110,15 +111,15 @@ test-floor: build/floor/.installed
 build/floor/.installed: pyproject.toml requirements/floor.lock
 	rm -rf build/floor
 	$(PYTHON) -m venv build/floor
-	build/floor/bin/python $(ONCE) --require-hashes --requirement requirements/floor.lock
-	build/floor/bin/python $(ONCE) --no-deps --no-build-isolation --editable .
+	build/floor/bin/python $(INSTALL) --require-hashes --requirement requirements/floor.lock
+	build/floor/bin/python $(INSTALL) --no-deps --no-build-isolation --editable .
 	@touch $@
 
 # The quick tests with the newest versions allowed, whatever is locked
 test-ceiling:
 	rm -rf build/ceiling
 	$(PYTHON) -m venv build/ceiling
-	build/ceiling/bin/python $(ONCE) --editable '.[quick]'
+	build/ceiling/bin/python $(INSTALL) --editable '.[quick]'
 	$(OTHERS) build/ceiling/bin/python $(QUICKLY) $(UNDAMAGED)
 
 # Source distribution, a wheel made of it, and far from this folder, in an environment of what the
@@ -132,10 +133,10 @@ wheel: setup
 	  trap 'rm -rf "$$away"' EXIT; set -e; \
 	  $(BIN)/python -m venv $$away/venv; cp -R tests pyproject.toml $$away; cd $$away; \
 	  sed -n 's/^\([a-z0-9].*[^ ]\) *\\$$/\1/p' $$lock > locked.txt; \
-	  venv/bin/python $(PIP) install --constraint locked.txt "$$wheel"; \
+	  venv/bin/python $(INSTALL) --constraint locked.txt "$$wheel"; \
 	  for name in $$(venv/bin/python -c 'from rcirl_jax.cli.rcirl import COMMANDS as x; print(*x)'); do \
 	    venv/bin/rcirl $$name --help > $$name.txt; done; \
-	  venv/bin/python $(PIP) install --constraint locked.txt "$$wheel[quick]"; \
+	  venv/bin/python $(INSTALL) --constraint locked.txt "$$wheel[quick]"; \
 	  venv/bin/python -m pip check; \
 	  venv/bin/python -c 'import rcirl_jax as r; print(r.__file__)'; \
 	  venv/bin/python $(QUICKLY)
@@ -148,7 +149,7 @@ lint: setup
 	$(BIN)/lint-imports
 
 $(VENV)/.bench: pyproject.toml | setup
-	$(BIN)/python $(PIP) install --editable '.[bench]'
+	$(BIN)/python $(INSTALL) --editable '.[bench]'
 	@touch $@
 
 # All benchmarks, three quarters of an hour; wants a quiet machine. Writes benchmarks/results and
@@ -209,7 +210,7 @@ lock: build/tools/.installed
 
 build/tools/.installed: $(if $(LOCK),$(LOCK)/tools.lock,requirements/tools.in)
 	$(PYTHON) -m venv build/tools
-	build/tools/bin/python $(PIP) install --requirement $<
+	build/tools/bin/python $(INSTALL) --requirement $<
 	@touch $@
 
 # Known vulnerabilities of the locked versions; `AUDIT=--vulnerability-service=osv` asks elsewhere

@@ -47,7 +47,7 @@ class Command:
 
     name: str
     minutes: int  # of two quiet cores
-    line: str  # after `python -m`
+    line: str  # after `python -m`; several with " && "
     files: dict[str, str]  # file of benchmarks/results -> what it is in the folder
     after: str = ""  # the command whose folder {after} it reads
 
@@ -175,9 +175,11 @@ COMMANDS = (
         after="chain",
     ),
     Command(
-        "verdict_gain_1",  # twice the recipe's gain
+        "verdict_gain_1",  # a third above the recipe's gain
         60,
-        "rcirl_jax gate --candidate={after}/dials/2.msgpack --incumbent=hand-set "
+        "rcirl_jax export --weights={after}/weights.msgpack --dial=1.33333333 "
+        "--output={out}/weights.msgpack && "
+        "rcirl_jax gate --candidate={out}/weights.msgpack --incumbent=hand-set "
         "--tuned_idm={after}/tuned_idm.json --data={us101},{urban},{i80} --workers=2 "
         "--output={out}/verdict.json",
         {"verdict_gain_1": "verdict.json"},
@@ -245,14 +247,15 @@ def make(
       places: of the datasets and recordings, by name.
     """
     out = folder / command.name
-    line = command.line.format(out=out, after=folder / command.after, **places)
-    print(f"python -m {line}", flush=True)
-    done = subprocess.run([sys.executable, "-m", *shlex.split(line)], check=False)
-    if done.returncode:
-        raise InputError(
-            f"{command.name}: its command ended with status {done.returncode}, for the "
-            "reason above; run it again to go on"
-        )
+    lines = command.line.format(out=out, after=folder / command.after, **places)
+    for line in lines.split(" && "):
+        print(f"python -m {line}", flush=True)
+        done = subprocess.run([sys.executable, "-m", *shlex.split(line)], check=False)
+        if done.returncode:
+            raise InputError(
+                f"{command.name}: its command ended with status {done.returncode}, for "
+                "the reason above; run it again to go on"
+            )
     for file, made in command.files.items():
         body = rounded(json.loads((out / made).read_text()))
         write_whole(results / f"{file}.json", json.dumps(body, indent=1) + "\n")

@@ -48,8 +48,8 @@ def test_only_what_is_missing_or_old_is_made_and_numbers_keep_five_digits(tmp_pa
     given, folder = tmp_path / "given.json", tmp_path / "runs"
     made_by = {"code_sha256": code_sha256()}
     given.write_text(json.dumps({"x": 1.2345678, "made_by": made_by}))
-    line, files = f"json.tool {given} {{out}}/a.json", {"shift": "a.json"}
-    tiny = remake.Command("tiny", 1, line, files)
+    lines = f"json.tool {given} {{out}}/b && json.tool {{out}}/b {{out}}/a.json"
+    tiny = remake.Command("tiny", 1, lines, {"shift": "a.json"})
     (folder / "tiny").mkdir(parents=True)
     assert remake.left_of([tiny], tmp_path) == {"tiny": ["shift.json missing"]}
     remake.make(tiny, folder, tmp_path, {})
