@@ -455,10 +455,12 @@ def _recorded(pair: Pair, config: GateConfig) -> Iterator[Check]:
         pairs, note = (int(np.sum(more < 0.0)), int(np.sum(more > 0.0))), ""
         found, p = paired_rates(pairs, total), no_more_faults(*pairs, total, margin)
         fails, passes = found.mean < 0.0 and found.p < 2.0 * ALPHA, p <= ALPHA
+        never = no_more_faults(0, 0, total, margin) > ALPHA
         if name != "collision":
             passes = found.low > -margin
             fails = bool(found.high < 0.0 and not passes)
-        if not (fails or passes) and no_more_faults(0, 0, total, margin) > ALPHA:
+            never = paired_rates((0, 0), total).low <= -margin
+        if not (fails or passes) and never:
             note = f"{total} vehicles can never prove a margin of {100 * margin:g} %"
         name = f"recorded {name}"
         numbers = {"margin": margin, "pairs": pairs, "p": p, "note": note}

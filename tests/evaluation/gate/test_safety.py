@@ -348,3 +348,26 @@ def test_safety_among_recorded_traffic(mine, theirs, outcomes):
     if "fail" in outcomes:
         assert "among recorded traffic" in verdict.sentence
         assert verdict.decision == "do not ship"
+
+
+@pytest.mark.parametrize(
+    ("count", "outcomes"),
+    [(147, ("open",) * 3), (148, ("pass", "open", "open")), (150, ("pass",) * 3)],
+)
+def test_too_few_vehicles_to_pass_are_said_to_be_too_few(count, outcomes):
+    """Nobody offends: collisions pass by the exact test, the others by Tango's."""
+    names = ("collision", "ttc", "braking")
+    row = {name: np.zeros(count) for name in (*names, "headway")}
+    known = likeness(candidate=0.5)
+    known = Likeness(
+        distance={name: x[:count] for name, x in known.distance.items()},
+        clusters=np.arange(count),
+        available=count,
+        traffic={"candidate": row, "incumbent": row},
+    )
+    verdict = judge(pair(smoother(drives()), drives(), likeness=known), GateConfig())
+    found = [check_of(verdict, f"recorded {name}") for name in names]
+    assert tuple(check.outcome for check in found) == outcomes
+    never = f"{count} vehicles can never prove a margin of 2.5 %"
+    notes = {"open": never, "pass": ""}
+    assert [check.note for check in found] == [notes[x] for x in outcomes]
