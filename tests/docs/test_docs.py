@@ -12,6 +12,7 @@ import pytest
 
 from rcirl_jax.cli.rcirl import COMMANDS
 from rcirl_jax.evaluation.gate.types import EXIT_CODES, GateConfig
+from rcirl_jax.train.featurise import NORMALISER_SCENES
 from tests.docs.pages import (
     ALL,
     DOCS,
@@ -199,6 +200,11 @@ def test_the_gates_margins_and_exit_status_are_those_of_the_code():
     assert {k: float(v) for k, v in stated.items()} == GateConfig().margins
     rows = table(section(text, "## Verdicts and exit status"))
     assert {row[0]: int(row[2]) for row in rows} == EXIT_CODES
+
+
+def test_the_guards_ranges_are_of_as_many_scenes_as_the_page_says():
+    text = (DOCS / "guard.md").read_text()
+    assert f"of up to {NORMALISER_SCENES:,} training scenes" in text
 
 
 @pytest.fixture(scope="module")
