@@ -136,19 +136,16 @@ def test_a_light_that_has_demanded_a_stop_does_so_until_it_is_green():
     lines = make_case(
         lines=[{"kind": 1, "s": 70.0, "green": 20.0, "yellow": 4.0, "red": 16.0}]
     ).lines
-    v = jnp.asarray([18.0])  # stops within 54 m at 3 m/s^2
 
-    def halts(before, time, distance):
+    def halts(before, time, distance, v=18.0):  # stops within 54 m at 3 m/s^2
         asked = jnp.asarray([before] + [False] * (lines.s.size - 1))
-        return bool(
-            stopping_for_light(
-                lines, asked, jnp.asarray(time), distance - 0 * lines.s, v
-            )[0]
-        )
+        now, away = jnp.asarray(time), distance - 0 * lines.s
+        return bool(stopping_for_light(lines, asked, now, away, jnp.asarray([v]))[0])
 
     assert not halts(False, 10.0, 60.0)  # green
     assert halts(False, 20.5, 60.0)
     assert not halts(False, 20.5, 50.0)  # too near to stop: it may go on
+    assert halts(False, 21.0, 49.0, v=17.0)  # has braked since, and can stop now
     assert halts(True, 20.7, 50.0)  # was asked when it could
     assert halts(False, 25.0, 50.0)  # red
     assert not halts(True, 41.0, 50.0)  # green again
