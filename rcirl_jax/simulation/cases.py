@@ -138,8 +138,9 @@ class Agents(flax.struct.PyTreeNode, kw_only=True):
 class Perception(flax.struct.PyTreeNode, kw_only=True):
     """The errors of the planner's perception of the agents."""
 
-    sigma_position: jax.Array  # [] m, noise of s and l, per step and agent
-    sigma_speed: jax.Array  # [] 1, relative noise of the speed
+    # [] m, noise of s, drawn for each step and agent; that of l has half the spread
+    sigma_position: jax.Array
+    sigma_speed: jax.Array  # [] 1, relative noise of the speed, of the draw of s
     latency: jax.Array  # [] s, age of what is seen, at most (H - 1) * 0.1
     dropout: jax.Array  # [] 1, probability that an agent is missed in a step
 

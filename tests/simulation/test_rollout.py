@@ -22,6 +22,7 @@ from rcirl_jax.simulation.rows import (
     rule_row,
 )
 from rcirl_jax.simulation.suite import build, drive_row, suite_refs
+from rcirl_jax.simulation.world import perceive, start
 from rcirl_jax.units import TIMES_S
 from tests.simulation.drives import constant, drive, stack
 from tests.simulation.worlds import make_case
@@ -159,6 +160,18 @@ def test_latency_noise_and_dropouts_act_and_are_seeded():
     assert np.abs(noisy - other).max() > 0.1
     _, kept = seen_by_planner(dropout=0.3)
     assert 0.4 < kept.mean() < 0.95
+
+
+def test_a_speed_has_the_noise_of_its_station_and_an_offset_half_the_spread():
+    case = make_case([{"s": 40.0}], sigma_position=0.3, sigma_speed=0.05, seed=7)
+    case = jax.tree.map(jnp.asarray, case)
+    world = start(case)
+    key = jax.random.fold_in(jax.random.key(7), world.step)
+    along, aside, _ = np.asarray(jax.random.normal(key, (3, NUM_AGENTS)))
+    seen = perceive(case, world)
+    assert seen.s[0] == pytest.approx(40.0 + 0.3 * along[0], abs=1e-4)
+    assert seen.v[0] == pytest.approx(10.0 * (1.0 + 0.05 * along[0]), abs=1e-4)
+    assert seen.l[0] == pytest.approx(0.15 * aside[0], abs=1e-4)
 
 
 def replay_case(turns_reactive):
