@@ -15,6 +15,7 @@ from rcirl_jax.runtime.specs import spec_root
 from rcirl_jax.simulation.suite import suite_refs
 
 FULL = [(ref.family, ref.index) for ref in suite_refs("full", seed=3)]
+NEW = [("slow_vehicle", i) for i in range(180)]  # the family of docs/extending.md
 
 
 def test_the_suite_of_this_version_is_the_full_one():
@@ -31,6 +32,7 @@ def test_the_suite_of_this_version_is_the_full_one():
         ([("easy", i) for i in range(30)], "30 cases, 4,140 of the full suite's"),
         ([*FULL, ("easy", 0)], "another suite: easy: cases beyond"),
         ([*FULL, ("cut_in", 180)], "another suite: cut_in: cases beyond"),
+        ([*FULL, *NEW], "another suite: slow_vehicle: cases beyond"),
     ],
 )
 def test_other_cases_are_a_part_or_another_suite(cases, says):
