@@ -12,6 +12,7 @@ import pytest
 
 from rcirl_jax.cli.rcirl import COMMANDS
 from rcirl_jax.evaluation.gate.types import EXIT_CODES, GateConfig
+from rcirl_jax.evaluation.gate.verdict import MATERIAL
 from rcirl_jax.train.featurise import NORMALISER_SCENES
 from tests.docs.pages import (
     ALL,
@@ -200,6 +201,7 @@ def test_the_gates_margins_and_exit_status_are_those_of_the_code():
     assert {k: float(v) for k, v in stated.items()} == GateConfig().margins
     rows = table(section(text, "## Verdicts and exit status"))
     assert {row[0]: int(row[2]) for row in rows} == EXIT_CODES
+    assert (MATERIAL, "is more than half of the margin" in text) == (0.5, True)
 
 
 def test_the_guards_ranges_are_of_as_many_scenes_as_the_page_says():
