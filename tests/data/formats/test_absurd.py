@@ -2,26 +2,20 @@
 
 import pytest
 
-from rcirl_jax.data import formats
+from rcirl_jax.data.formats.csv import reader
 from rcirl_jax.data.readers.tables import streams
 from tests.data.formats.fixtures import csv, format_of, modules
 from tests.helpers.logs import read, refused
 
 
-def made(folder):
-    folder.mkdir(parents=True)
-    return folder
-
-
-WHOLE = ["levelx_highd", "openacc"]  # with and without a reader of its own
-
-
 def first_file(name, folder):
     """The first file of a sound log."""
-    return modules()[name].write(made(folder)).files[0]
+    folder.mkdir()
+    return modules()[name].write(folder).files[0]
 
 
-@pytest.mark.parametrize("name", WHOLE)
+# with and without a reader of its own
+@pytest.mark.parametrize("name", ["levelx_highd", "openacc"])
 def test_a_log_that_is_held_whole_has_a_size(name, tmp_path):
     file = first_file(name, tmp_path / "in")
     with file.open("r+b") as opened:
@@ -53,19 +47,16 @@ def test_a_line_without_an_end_is_not_held(name, where, tmp_path, monkeypatch):
 def test_a_fault_of_ours_is_not_the_users(tmp_path, monkeypatch):
     """Errors of bad data become one line; a bug passes, with a note on the file."""
     fixture = csv.write(tmp_path)
-    module = formats.importlib.import_module("rcirl_jax.data.formats.csv.reader")
 
-    def broken(error):
-        def recordings(path, spec):
-            yield from ()
-            raise error
+    def broken(path, spec):
+        yield from ()
+        raise fault
 
-        monkeypatch.setattr(module, "recordings", recordings)
-
-    broken(ValueError("cannot convert"))
+    monkeypatch.setattr(reader, "recordings", broken)
+    fault = ValueError("cannot convert")
     line = refused(read, "csv", fixture.input)
     assert "ValueError: cannot convert: expected a sound log of format csv" in line
-    broken(KeyError("stations"))
+    fault = KeyError("stations")
     with pytest.raises(KeyError) as caught:
         read("csv", fixture.input)
     (note,) = caught.value.__notes__

@@ -9,6 +9,7 @@ import pytest
 from rcirl_jax.data.formats import parts, read_recordings
 from rcirl_jax.types import Kind
 from tests.data.formats.fixtures import apollo as fixture
+from tests.data.formats.fixtures import has_note
 from tests.helpers import logs
 from tests.helpers.logs import tracks_of
 
@@ -38,13 +39,6 @@ def ego_only(seconds=2.0, **options):
         (LOCALIZATION, 0.1 * k, fixture.localization(0.1 * k, **options))
         for k in range(round(10 * seconds) + 1)
     ]
-
-
-def has_note(recording, words):
-    return any(words in note for note in recording.notes)
-
-
-# ---------------------------------------------------------------- well-formed
 
 
 def test_parts_are_drives(tmp_path):
@@ -134,9 +128,6 @@ def test_topics_stamped_on_different_clocks(tmp_path):
     assert tracks_of(recording)["12"].t[0] == pytest.approx(0.0, abs=1e-6)
 
 
-# -------------------------------------------------------------------- routing
-
-
 def place(number):
     """A destination, m from the local origin once it is read."""
     return (fixture.CENTRE[0] + 200.0 + number, fixture.CENTRE[1] + 1.0)
@@ -154,25 +145,23 @@ def destinations(recording):
     }
 
 
-@pytest.mark.parametrize(
-    ("name", "kind", "make"),
-    [
-        *[
-            (f"/apollo/{name}", fixture.CHANNELS[ROUTING], fixture.routing)
-            for name in ("routing_response", "raw_rrouting_response_history")
-        ],
-        # Apollo 9 and later; a record from mid-drive has the history alone
-        *[
-            (f"/apollo/{name}", "apollo.planning.PlanningCommand", fixture.command)
-            for name in ("planning/command", "planning_command_history")
-        ],
-    ],
-)
-def test_routing_of_every_release(tmp_path, name, kind, make):
-    messages = [(name, 0.3, make(*place(0))), *ego_only(5.0)]
-    if make is fixture.command:
-        messages.append((name, 3.0, fixture.parking()))
+@pytest.mark.parametrize("name", ["routing_response", "raw_rrouting_response_history"])
+def test_routing(tmp_path, name):
+    name, kind = f"/apollo/{name}", fixture.CHANNELS[ROUTING]
+    messages = [(name, 0.3, fixture.routing(*place(0))), *ego_only(5.0)]
     channels = {**fixture.CHANNELS, name: kind}
+    assert destinations(only(tmp_path, messages, channels=channels)) == {
+        "ego": place(0)
+    }
+
+
+@pytest.mark.parametrize("name", ["planning/command", "planning_command_history"])
+def test_routing_since_apollo_9(tmp_path, name):
+    """A record from mid-drive has the history alone."""
+    name = f"/apollo/{name}"
+    messages = [(name, 0.3, fixture.command(*place(0))), *ego_only(5.0)]
+    messages.append((name, 3.0, fixture.parking()))
+    channels = {**fixture.CHANNELS, name: "apollo.planning.PlanningCommand"}
     recording = only(tmp_path, messages, channels=channels)
     assert destinations(recording) == {"ego": place(0)}
     assert not has_note(recording, "no routing")

@@ -7,6 +7,7 @@ import pytest
 
 from rcirl_jax.types import Kind
 from tests.data.formats.fixtures import argoverse2 as w
+from tests.data.formats.fixtures import has_note
 from tests.helpers import logs
 from tests.helpers.logs import lanes_of, refused, tracks_of
 
@@ -30,29 +31,28 @@ def whole(tmp_path_factory):
 def test_lanes(whole):
     assert (whole.rate_hz, whole.name, whole.group) == (10.0, w.SCENARIO, w.SLICE)
     lanes = lanes_of(whole)
-    first = lanes["205119001"]
-    np.testing.assert_allclose(first.left_width, w.WIDTH / 2, atol=0.01)
-    np.testing.assert_allclose(first.centre[:, 0], w.EAST + w.WIDTH / 2, atol=0.01)
-    assert first.successors == ("205119003", "205119006")
+    inner, outer = lanes["205119001"], lanes["205119002"]
+    np.testing.assert_allclose(outer.left_width, w.WIDTH / 2, atol=0.01)
+    np.testing.assert_allclose(outer.centre[:, 1], w.PLACE[1], atol=0.01)
+    assert outer.successors == ("205119004", "205119006")
     # the oncoming lane is named as left neighbour in the file
-    assert (first.left, first.right) == (None, "205119002")
-    assert lanes["205119002"].left == "205119001"
+    assert (inner.left, inner.right, outer.left) == (None, "205119002", "205119001")
     # the bicycle lane is left out, and so is a successor that the map lacks
-    assert (lanes["205119002"].right, lanes["205119003"].successors) == (None, ())
-    assert any("1 lanes not of type" in note for note in whole.notes)
+    assert (outer.right, lanes["205119003"].successors) == (None, ())
+    assert has_note(whole, "1 lanes not of type")
     assert whole.signals == ()
     oncoming, turn = lanes["205119005"].centre, lanes["205119006"].centre
-    assert oncoming[-1, 1] < oncoming[0, 1]
+    assert oncoming[-1, 0] < oncoming[0, 0]
     # a turning lane lies midway between its bounds
-    middle = np.array([w.EAST - 20.0 + w.WIDTH / 2, w.NORTH + 30.0])
-    np.testing.assert_allclose(np.hypot(*(turn - middle).T), 20.0, atol=0.1)
+    middle = np.add(w.PLACE, (60.0, 25.0))
+    np.testing.assert_allclose(np.hypot(*(turn - middle).T), 25.0, atol=0.1)
 
 
 def test_options(tmp_path):
     assert len(scenario(tmp_path, lane_types=["VEHICLE", "BIKE"]).lanes) == 7
     recording = scenario(tmp_path, min_category=1)
     assert "138902" not in tracks_of(recording)
-    assert any("3 tracks below category 1" in note for note in recording.notes)
+    assert has_note(recording, "3 tracks below category 1")
     sizes = {**PACKAGED["sizes"], "bus": [18.0, 2.55]}
     tracks = scenario(tmp_path, sizes=sizes).tracks
     assert {track.length for track in tracks if "139400" in track.id} == {18.0}
@@ -81,9 +81,6 @@ def test_scenario_id_does_not_lead_out_of_the_folder(tmp_path):
     map_file.rename(tmp_path / "secret.json")
     (path.parent / "log_map_archive_").mkdir()
     assert "map: missing" in refused(read, path)
-
-
-# ----------------------------------------------------------------------- recorded
 
 
 @pytest.mark.dataset

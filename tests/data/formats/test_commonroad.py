@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from rcirl_jax.types import Kind
 from tests.data.formats import writers as w
+from tests.data.formats.fixtures import has_note
 from tests.helpers import logs
 from tests.helpers.logs import refused
 
@@ -34,19 +35,11 @@ def test_both_versions(tmp_path, version):
     parked = w.car("31", kind="parkedVehicle", version=version, count=2, y=-5)
     parts = (w.lanelet(), w.car(version=version), w.standing(version=version), parked)
     recording = scenario(tmp_path, *parts, version=version)
-    assert (recording.name, recording.rate_hz) == ("a", pytest.approx(10.0))
     track, *standing = recording.tracks
-    assert (track.id, track.kind, track.length, track.width) == ("10", 1, 4.4, 1.8)
-    found = (("motorcycle", Kind.VEHICLE), ("bicycle", Kind.CYCLIST))
-    for kind, expected in (*found, ("pedestrian", Kind.PEDESTRIAN)):
-        made = scenario(tmp_path, w.lanelet(), w.car(kind=kind))
-        assert made.tracks[0].kind == expected
-    steps = np.arange(40)
-    np.testing.assert_allclose(track.t, 0.1 * steps)
-    np.testing.assert_allclose(track.x, 1.5 * steps)
+    np.testing.assert_allclose(track.x, 1.5 * np.arange(40))
     np.testing.assert_array_equal(track.speed, 15.0)
     assert recording.group == "a"
-    assert any("its own group" in note for note in recording.notes)
+    assert has_note(recording, "its own group")
     assert [one.kind for one in standing] == [Kind.STATIC, Kind.STATIC]
     for one in standing:
         np.testing.assert_allclose(one.t, track.t)
@@ -54,20 +47,12 @@ def test_both_versions(tmp_path, version):
         assert not one.speed.any()
 
 
-def test_shapes_and_their_offsets(tmp_path):
-    circle = "<circle><radius>0.4</radius></circle>"
-    corners = [(0, 0), (4, 0), (4, 2), (0, 2)]
-    polygon = f"<polygon>{''.join(w.POINT.format(*p) for p in corners)}</polygon>"
-    turned = w.standing("31", shape=polygon, x=50, y=10, heading=np.pi / 2)
-    parts = (w.lanelet(), w.car(), w.standing("30", shape=circle), turned)
-    _, round_one, box = scenario(tmp_path, *parts).tracks
-    assert (round_one.length, round_one.width) == (0.8, 0.8)
-    assert (box.length, box.width) == (4.0, 2.0)
-    # the box centre (2, 1) of the polygon, turned by 90 degrees to the left
-    np.testing.assert_allclose([box.x[0], box.y[0]], [49.0, 12.0])
-
-
-# ---------------------------------------------------------------------------- lanes
+@pytest.mark.parametrize(
+    ("kind", "expected"), [("motorcycle", Kind.VEHICLE), ("bicycle", Kind.CYCLIST)]
+)
+def test_kinds(tmp_path, kind, expected):
+    (track,) = scenario(tmp_path, w.lanelet(), w.car(kind=kind)).tracks
+    assert track.kind == expected
 
 
 def test_lane_geometry_from_unequal_bounds(tmp_path):
@@ -91,7 +76,7 @@ def test_speed_limits(tmp_path):
     )
     assert [lane.speed_limit for lane in recording.lanes] == [13.4112, None, None]
     assert recording.default_speed_limit == 13.4112
-    assert any("speed limit" in note for note in recording.notes)
+    assert has_note(recording, "speed limit")
     body = w.lanelet(extra="<speedLimit>20</speedLimit>") + w.car(version="2018b")
     assert scenario(tmp_path, body, version="2018b").lanes[0].speed_limit == 20.0
 
@@ -137,9 +122,6 @@ def test_stop_lines_signs_and_lights(tmp_path):
     assert second.signal_ids == ("7",)
 
 
-# --------------------------------------------------------------------------- lights
-
-
 def lit(folder, phases, **options):
     """The signal of a cycle."""
     (signal,) = scenario(folder, road(), w.light("7", phases, **options)).signals
@@ -164,8 +146,6 @@ def test_signal_cycle_against_modular_arithmetic(tmp_path_factory, durations, of
         index = np.searchsorted(signal.start, 0.1 * step + 1e-6, side="right") - 1
         assert signal.state[index] == shown.get(expected, expected)
 
-
-# --------------------------------------------------------- missing cars, groups, rest
 
 RECTANGLE = (
     "<position><rectangle><length>2</length><width>2</width>"
@@ -193,9 +173,6 @@ def test_groups_beside_and_above_the_folder(tmp_path):
     for text in ("name,number\na.xml,1\n", "file,group\na.xml\n"):
         table.write_text(text)
         assert "csv: row 1: " in refused(read, file)
-
-
-# -------------------------------------------------------------------------- recorded
 
 
 @pytest.mark.dataset
@@ -236,16 +213,3 @@ def test_recorded_states_are_those_of_the_file(data_dir):
         np.testing.assert_array_equal(track.speed, speed)
     limits = {lane.speed_limit for lane in recording.lanes}
     assert limits <= {None, 11.176, 13.4112, 15.6464}
-
-
-def test_intervals_become_midpoints(tmp_path):
-    between = (
-        "<velocity><intervalStart>14</intervalStart><intervalEnd>16</intervalEnd>"
-        "</velocity></state>"
-    )
-    states = [
-        w.state(k, 1.5 * k, 0, drop=("velocity",)).replace("</state>", between)
-        for k in range(1, 5)
-    ]
-    made = scenario(tmp_path, w.lanelet(), w.car(states=states))
-    np.testing.assert_allclose(made.tracks[0].speed, 15.0)

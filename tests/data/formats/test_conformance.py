@@ -5,6 +5,7 @@ module named otherwise than its format says so by FORMAT.
 """
 
 import collections
+import functools
 import os
 import pickle
 import re
@@ -15,6 +16,7 @@ import shapely
 
 from rcirl_jax.data.formats import IMPORTERS, parts, read_part, read_recordings
 from rcirl_jax.data.formats.recognise import recognised_format
+from rcirl_jax.data.formats.tracks import of_one_name
 from rcirl_jax.data.importing import ImportConfig, digest, import_logs
 from rcirl_jax.data.inputs import input_files
 from rcirl_jax.data.quality import assumed
@@ -24,13 +26,13 @@ from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Kind
 from tests.data.formats import fixtures as formats
-from tests.data.formats.fixtures import format_of
+from tests.data.formats import writers as w
+from tests.data.formats.fixtures import format_of, has_note, waymo
 from tests.helpers import logs
 from tests.helpers.logs import refused
 
 SPEED_TOLERANCE_MPS = 0.3  # m/s
 SIZE_TOLERANCE_M = 0.02  # m
-HEADING_TOLERANCE = 0.02  # rad
 TIME_TOLERANCE_S = 0.006  # s, stamps rounded to 10 ms
 
 
@@ -52,10 +54,15 @@ def name(request):
 
 
 @pytest.fixture(scope="module")
-def sound(name, tmp_path_factory):
+def written(tmp_path_factory):
+    """Name -> a fixture that nothing is done to; each is written once."""
+    return functools.cache(lambda name: write(name, tmp_path_factory.mktemp(name)))
+
+
+@pytest.fixture(scope="module")
+def sound(name, written):
     """A fixture that nothing is done to, and its recordings."""
-    fixture = write(name, tmp_path_factory.mktemp("sound"))
-    return fixture, read(name, fixture)
+    return written(name), read(name, written(name))
 
 
 def find(recordings, label, expected):
@@ -88,9 +95,8 @@ def test_what_was_written_is_found(sound):
         assert apart.max() <= fixture.tolerance_m, (label, apart.max())
         fast = np.abs(track.speed - expected.speed)
         assert fast.max() <= SPEED_TOLERANCE_MPS, (label, fast.max())
-        if fixture.has_heading:
-            turn = np.angle(np.exp(1j * (track.heading - expected.heading)))
-            assert np.abs(turn).max() <= HEADING_TOLERANCE, (label, np.abs(turn).max())
+        turn = np.abs(np.angle(np.exp(1j * (track.heading - expected.heading))))
+        assert turn.max() <= fixture.heading_tolerance, (label, turn.max())
     assert max(len(r.lanes) for r in recordings) >= fixture.num_lanes
     assert max(len(r.signals) for r in recordings) >= fixture.num_signals
 
@@ -167,11 +173,11 @@ def test_parts_read_apart_make_up_the_whole(name, sound):
 
 
 @pytest.mark.parametrize("name", ["apollo", "nuplan", "ros2"])
-def test_windows_hold_the_scenes_of_the_drive(name, tmp_path, monkeypatch):
+def test_windows_hold_the_scenes_of_the_drive(name, written, monkeypatch):
     """Road users keep their names; surroundings are shortened to those of 8 s."""
     monkeypatch.setattr(long_logs, "BEFORE_S", 1.0)
     monkeypatch.setattr(long_logs, "AFTER_S", 2.5)
-    place = write(name, tmp_path).input
+    place = written(name).input
     whole = logs.only(name, place)
     found = logs.read(name, place, window_s=3.0)
     assert [one.name for one in found] == [f"{whole.name}-{k:03d}" for k in range(3)]
@@ -207,7 +213,48 @@ def test_without_a_map_lanes_follow_the_paths(name, tmp_path):
             file.unlink()
     made = read(name, fixture)[0]
     assert made.lanes[0].id.startswith("lane-")
-    assert any("no map" in note for note in made.notes)
+    assert has_note(made, "no map")
+
+
+TABLES = ("csv", "interaction", "levelx", "ngsim_pairs", "openacc")
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_without_rows_is_empty(name, tmp_path):
+    """It is a recording without traffic, which an import counts and skips."""
+    log = write(name, tmp_path).files[0]
+    lines = log.read_text().splitlines(keepends=True)
+    head = next(k for k, line in enumerate(lines) if line[:1].isdigit())
+    log.write_text("".join(lines[:head]))
+    (made, *_) = read_recordings(format_of(name), log)
+    assert made.tracks == ()
+    assert has_note(made, "rows: none")
+
+
+def test_the_longest_track_of_one_id_counts(tmp_path):
+    fixture = waymo.write(tmp_path)
+    waymo.cars(count=2)(fixture)
+    made = logs.only("waymo", fixture.input)
+    assert [track.id for track in made.tracks] == ["1"]
+    assert has_note(made, "1 tracks with the id of another left out")
+    parts = (w.lanelet(), w.car(count=20), w.car(count=40))
+    made = logs.only("commonroad", w.commonroad(tmp_path / "a.xml", *parts))
+    assert [track.t.size for track in made.tracks] == [40]
+    assert has_note(made, "1 tracks with the id of another left out")
+    kept, notes = of_one_name([*made.tracks] * 3)
+    assert (len(kept), notes) == (3, [])
+
+
+def test_what_the_users_own_toml_states_is_no_guess(written, tmp_path):
+    """Its limit is that of fitted lanes, its [ego] the size of the recording car."""
+    fixture, source = written("apollo"), tmp_path / "drives.toml"
+    source.write_text("rate_hz = 10.0\n")
+    assert counts(logs.read("apollo", fixture.input, source)) == fixture.assumed
+    source.write_text("speed_limit = 13.9\n[ego]\nlength = 4.4\nwidth = 1.9\n")
+    made = logs.only("apollo", fixture.input, source)
+    assert counts([made]) == (0, 4, 0)
+    assert {lane.speed_limit for lane in made.lanes} == {made.default_speed_limit}
+    assert made.default_speed_limit == 13.9
 
 
 def imported(name, fixture, output):
@@ -256,11 +303,11 @@ class Bomb:
 
 
 @pytest.mark.parametrize("damage", ["cut short", "a pickle"])
-def test_damaged_files(name, sound, damage, tmp_path):
+def test_damaged_files(name, damage, tmp_path):
     """Each in its turn; an import says the same line and leaves nothing."""
-    for place in range(len(sound[0].files)):
-        fixture, target = write(name, tmp_path / str(place)), tmp_path / "executed"
-        path = fixture.files[place]
+    fixture, target = write(name, tmp_path / "log"), tmp_path / "executed"
+    for path in fixture.files:
+        content = path.read_bytes()
         if damage == "cut short":
             cut_short(path)
         else:
@@ -271,12 +318,12 @@ def test_damaged_files(name, sound, damage, tmp_path):
         assert line in refused(imported, name, fixture, tmp_path / "dataset")
         assert not (tmp_path / "dataset").exists()
         assert not target.exists(), f"{path.name}: code was executed"
+        path.write_bytes(content)
 
 
-def test_a_word_for_a_number_is_refused_or_its_row_counted(name, sound, tmp_path):
-    for place, pattern in enumerate(sound[0].numbers.values()):
-        fixture = write(name, tmp_path / str(place))
-        path = list(fixture.numbers)[place]
+def test_a_word_for_a_number_is_refused_or_its_row_counted(name, tmp_path):
+    fixture = write(name, tmp_path)
+    for path, pattern in fixture.numbers.items():
         text = path.read_text()
         found = list(re.finditer(pattern, text, re.MULTILINE))
         start, end = found[len(found) // 2].span(1)
@@ -285,6 +332,7 @@ def test_a_word_for_a_number_is_refused_or_its_row_counted(name, sound, tmp_path
             assert sum(made.rows.unreadable for made in read(name, fixture)) == 1
         else:
             assert path.name in refused(read, name, fixture)
+        path.write_text(text)
 
 
 def of_all(table):
@@ -309,9 +357,9 @@ def test_what_is_wrong_in_a_file_is_named(name, words, harm, tmp_path):
 
 
 @pytest.mark.parametrize(("name", "number", "option"), of_all("OPTIONS"))
-def test_what_is_wrong_in_an_option_is_named(name, number, option, tmp_path):
-    (key,), place = option, write(name, tmp_path).input
-    line = refused(logs.read, format_of(name), place, **option)
+def test_what_is_wrong_in_an_option_is_named(name, number, option, written):
+    (key,) = option
+    line = refused(logs.read, format_of(name), written(name).input, **option)
     assert line.startswith(f"source TOML: {key}")
 
 

@@ -36,16 +36,6 @@ def folder(tmp_path):
     return fixture.write(tmp_path).input
 
 
-@pytest.fixture
-def dataset(tmp_path):
-    """One scene without a map."""
-    fixture.write_zarr(tmp_path / "one.zarr", scenes=1)
-    return tmp_path / "one.zarr"
-
-
-# --------------------------------------------------------------------- scenes
-
-
 def test_groups_over_datasets(folder):
     """Scenes of one drive in several datasets, also if only one of them is read."""
     scenes = folder / "scenes"
@@ -98,9 +88,6 @@ def test_reads_only_the_scene_it_is_at(folder):
     found = read_recordings("l5", folder)
     assert next(found).name == "sample-000000"
     assert "agents/2: chunk: missing" in refused(next, found)
-
-
-# ------------------------------------------------------------------------ map
 
 
 @pytest.mark.parametrize(
@@ -157,9 +144,6 @@ def test_light_of_a_lane(whole):
     assert (signal.state, signal.is_recorded) == (("red", "green"), True)
     green = fixture.STAMPS[fixture.GREEN_FROM]
     np.testing.assert_allclose(signal.start, [0.0, green], atol=1e-6)
-
-
-# ------------------------------------------------------------------- arrays
 
 
 def test_format_version_1_has_no_lights(folder):

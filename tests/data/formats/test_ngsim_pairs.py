@@ -1,9 +1,8 @@
-"""NGSIM pairs: feet, bumpers, groups of pairs that share a car, real files."""
+"""NGSIM pairs: groups of pairs that share a car, options, real files."""
 
 import functools
 import time
 
-import numpy as np
 import pytest
 
 from rcirl_jax.data.importing import ImportConfig, import_logs
@@ -13,24 +12,10 @@ from tests.helpers import logs
 
 read = functools.partial(logs.read, "ngsim_pairs")
 
-FOOT = fixture.FOOT
 
-
-def test_front_bumpers_in_feet(tmp_path):
-    path = fixture.write_pair(tmp_path, "1032", "1025", "00046")
-    (recording,) = read(path)
-    follower, leader = recording.tracks
-    assert (follower.id, leader.id) == ("1032", "1025")
-    assert leader.length == pytest.approx(14.3 * FOOT)
-    assert follower.length == 4.5
-    fronts = fixture.stations()
-    np.testing.assert_allclose(follower.x + 2.25, fronts["1032"][0] * FOOT)
-    np.testing.assert_allclose(leader.speed, fronts["1025"][1] * FOOT)
-    # the spacing of the file is that between the boxes
-    gap = (leader.x - 0.5 * leader.length) - (follower.x + 0.5 * follower.length)
-    np.testing.assert_allclose(gap, (70.0 - 14.3) * FOOT)
-    np.testing.assert_allclose(leader.t, 0.1 * np.arange(250))
-    assert any("length of follower 1032 unknown" in note for note in recording.notes)
+@pytest.fixture
+def pair(tmp_path):
+    return fixture.write_pair(tmp_path, "1032", "1025", "00046")
 
 
 def test_pairs_that_share_a_car_are_one_group(tmp_path):
@@ -50,27 +35,24 @@ def test_pairs_that_share_a_car_are_one_group(tmp_path):
     assert recording.group == "mine"
 
 
-def test_options(tmp_path):
-    path = fixture.write_pair(tmp_path, "1032", "1025", "00046")
+def test_options(pair, tmp_path):
     source = tmp_path / "s.toml"
     source.write_text("follower_length_m = 5.0\nwidth_m = 2.0\nspeed_limit = 30.0\n")
-    (recording,) = read(path, source)
+    (recording,) = read(pair, source)
     assert recording.tracks[0].length == pytest.approx(5.0)
     assert recording.tracks[0].width == 2.0
     assert recording.lanes[0].speed_limit == 30.0
     source.write_text('unit = "yard"\n')
-    line = logs.refused(read, path, source)
+    line = logs.refused(read, pair, source)
     assert "source TOML: unit: yard: expected one of ft, m" in line
 
 
-def test_only_the_follower_is_an_expert(tmp_path):
+def test_only_the_follower_is_an_expert(pair, tmp_path):
     """Whom the leader follows is not in the file: its scenes are dropped."""
-    path = fixture.write_pair(tmp_path, "1032", "1025", "00046")
-    (recording,) = read(path)
     config = ImportConfig(
         format="ngsim_pairs", collect=CollectConfig(), test_fraction=0.0
     )
-    manifest = import_logs([recording], tmp_path / "out", config)
+    manifest = import_logs(read(pair), tmp_path / "out", config)
     assert [name.rpartition(":")[2] for name in manifest.vehicles] == ["1032"]
     assert manifest.quality["dropped"]["follows_missing_car"] > 0
 

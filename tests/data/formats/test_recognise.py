@@ -5,7 +5,7 @@ import pytest
 from rcirl_jax.data.formats.recognise import recognised_format
 from tests.data.formats import people
 from tests.data.formats import writers as w
-from tests.data.formats.test_conformance import MODULES, format_of
+from tests.data.formats.fixtures import modules
 from tests.helpers.logs import read, refused
 
 
@@ -44,16 +44,13 @@ POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:f30\nsize 129\
 @pytest.mark.parametrize("name", ["argoverse2", "commonroad", "levelx", "ros2"])
 def test_git_lfs_pointers_are_called_by_their_name(name, tmp_path):
     """In place of any of the files, whatever the format."""
-    module = next(m for own, m in MODULES.items() if format_of(own) == name)
-    (tmp_path / "count").mkdir()
-    count = len(module.write(tmp_path / "count").files)
-    for place in range(count):
-        (tmp_path / str(place)).mkdir()
-        fixture = module.write(tmp_path / str(place))
-        file = fixture.files[place]
+    fixture = modules()[name].write(tmp_path)
+    for file in fixture.files:
+        content = file.read_bytes()
         if file.suffix == ".json":
             continue  # maps of Argoverse 2
         file.write_text(POINTER)
         line = refused(read, name, fixture.input)
         assert line.startswith(f"{file}: Git LFS pointer: expected the data")
         assert "git lfs pull" in line
+        file.write_bytes(content)

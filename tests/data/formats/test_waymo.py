@@ -9,6 +9,7 @@ import pytest
 
 from rcirl_jax.data.readers.tfrecord import read_records
 from rcirl_jax.types import Kind
+from tests.data.formats.fixtures import has_note
 from tests.data.formats.fixtures import waymo as w
 from tests.data.formats.fixtures.drives import straight
 from tests.helpers import logs
@@ -34,23 +35,6 @@ def scenario(folder, options=None, **changes):
 def whole(tmp_path_factory):
     """The recording of the fixture."""
     return only(w.write(tmp_path_factory.mktemp("waymo")).input)
-
-
-# --------------------------------------------------------------------- tracks
-
-
-def test_invalid_states_may_hold_anything(tmp_path):
-    """Published invalid states are empty or zero; their values never count."""
-    user = w.road_users()[2325][1]
-    bad = [{"center_x": float("nan"), "center_y": 1e300, "length": -1.0}, {}]
-    states = [
-        w.state(user, row) if 12 <= row < 60 else bad[row % 2]
-        for row in range(w.NUM_STEPS)
-    ]
-    tracks = [{"id": 7, "object_type": 1, "states": states}]
-    (track,) = scenario(tmp_path, tracks=tracks).tracks
-    np.testing.assert_array_equal(track.x, user.x[12:60])
-    assert track.length == pytest.approx(4.5)
 
 
 def test_kinds_and_what_is_left_out(tmp_path):
@@ -103,9 +87,6 @@ def test_up_to_a_tenth_of_the_tracks_may_be_impossible(tmp_path, change, rows, w
     assert f"record 0: track 100: {wrong}" in many
 
 
-# ------------------------------------------------------------------------ map
-
-
 def test_lanes(whole):
     lanes = lanes_of(whole)
     assert set(lanes) == {"101", "102", "103", "104"}
@@ -116,8 +97,8 @@ def test_lanes(whole):
     assert south.speed_limit == pytest.approx(25 * w.MPH)
     assert lanes["103"].speed_limit == pytest.approx(35 * w.MPH)
     assert whole.default_speed_limit == pytest.approx(25 * w.MPH)
-    assert any("1 lanes not of type" in note for note in whole.notes)
-    assert any("1 lanes of one point" in note for note in whole.notes)
+    assert has_note(whole, "1 lanes not of type")
+    assert has_note(whole, "1 lanes of one point")
 
 
 def test_widths_come_from_lines_and_edges(whole, tmp_path):
@@ -176,9 +157,6 @@ def test_no_map_and_no_limits(tmp_path):
     assert recording.lanes[0].speed_limit is None
 
 
-# -------------------------------------------------------------------- signals
-
-
 def test_signal_intervals_and_stop_lines(whole):
     (signal,) = whole.signals
     assert (signal.id, signal.is_recorded) == ("103", True)
@@ -213,9 +191,6 @@ def test_every_state(tmp_path, state, colour):
     # flashing red is a stop sign in effect
     assert lane.stop_sign == (state == 7)
     assert lane.stop_line is None  # no stop point was given
-
-
-# -------------------------------------------------------------------- framing
 
 
 def test_records_are_read_one_by_one_up_to_a_limit(tmp_path):

@@ -5,14 +5,16 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.runtime.specs import spec_root
-
 DT = 0.1  # s
 SPEED = 15.0  # m/s, of every car in these files
 POINT = "<point><x>{}</x><y>{}</y></point>"
 
 
 def exact(tag, value):
+    """A field of one value, or of an interval."""
+    if isinstance(value, tuple):
+        ends = zip(("intervalStart", "intervalEnd"), value, strict=True)
+        return f"<{tag}>{''.join(f'<{k}>{v}</{k}>' for k, v in ends)}</{tag}>"
     return f"<{tag}><exact>{value}</exact></{tag}>"
 
 
@@ -30,24 +32,18 @@ def state(step, x, y, *, tag="state", heading=0.0, speed=SPEED, drop=()):
 BOX = "<rectangle><length>4.4</length><width>1.8</width></rectangle>"
 
 
-def car(
-    name="10",
-    *,
-    version="2020a",
-    x0=0.0,
-    y=0.0,
-    count=40,
-    shape=BOX,
-    kind="car",
-    states=None,
-):
-    """A car at constant speed along +x."""
-    if states is None:
-        states = [state(k, x0 + SPEED * DT * k, y) for k in range(1, count)]
+def car(name="10", *, version="2020a", x0=0.0, y=0.0, count=40, **options):
+    """A car at constant speed along +x; `options` as of `moving`."""
+    states = [state(k, x0 + SPEED * DT * k, y) for k in range(1, count)]
+    options = {"states": states, "version": version, **options}
+    return moving(name, state(0, x0, y, tag="initialState"), **options)
+
+
+def moving(name, first, states, *, version="2020a", shape=BOX, kind="car"):
+    """A road user by its states; 2018b names it by its role."""
     tag, role = "dynamicObstacle", ""
     if version == "2018b":
         tag, role = "obstacle", "<role>dynamic</role>"
-    first = state(0, x0, y, tag="initialState")
     return (
         f'<{tag} id="{name}">{role}<type>{kind}</type><shape>{shape}</shape>'
         f"{first}<trajectory>{''.join(states)}</trajectory></{tag}>"
@@ -70,10 +66,11 @@ def bound(tag, points):
     return f"<{tag}>{''.join(POINT.format(x, y) for x, y in points)}</{tag}>"
 
 
-def lanelet(name="1", *, left=None, right=None, extra=""):
-    """A lanelet 200 m long and 3.5 m wide unless bounds are given."""
-    left = left or [(0, 1.75), (100, 1.75), (200, 1.75)]
-    right = right or [(0, -1.75), (200, -1.75)]
+def lanelet(name="1", *, left=None, right=None, extra="", start=0, length=200):
+    """A lanelet along x, 3.5 m wide unless bounds are given."""
+    end = start + length
+    left = left or [(start, 1.75), (start + length / 2, 1.75), (end, 1.75)]
+    right = right or [(start, -1.75), (end, -1.75)]
     return (
         f'<lanelet id="{name}">{bound("leftBound", left)}'
         f"{bound('rightBound', right)}{extra}</lanelet>"
@@ -88,7 +85,7 @@ def sign(name, kind, value=None):
     )
 
 
-def light(name, phases, *, offset=0, active="true"):
+def light(name, phases, *, offset=0):
     cycle = "".join(
         f"<cycleElement><duration>{duration}</duration><color>{color}</color>"
         "</cycleElement>"
@@ -96,25 +93,25 @@ def light(name, phases, *, offset=0, active="true"):
     )
     return (
         f'<trafficLight id="{name}"><cycle>{cycle}<timeOffset>{offset}</timeOffset>'
-        f"</cycle><active>{active}</active></trafficLight>"
+        "</cycle><active>true</active></trafficLight>"
     )
 
 
 def problem(goal, *, speed=10.0):
     """A planning problem that starts at the origin along +x at step 0."""
     first = state(0, 0.0, 0.0, tag="initialState", speed=speed)
-    time = "<time><intervalStart>20</intervalStart><intervalEnd>40</intervalEnd></time>"
+    time = exact("time", (20, 40))
     return (
         f'<planningProblem id="900">{first}<goalState>{goal}{time}</goalState>'
         "</planningProblem>"
     )
 
 
-def commonroad(path: Path, *parts, version="2020a", attributes="", prolog=""):
+def commonroad(path: Path, *parts, version="2020a", attributes=""):
     """Write a CommonRoad file; without parts: one car on one lanelet."""
     body = "".join(parts) or lanelet() + car(version=version)
     path.write_text(
-        f'<?xml version="1.0"?>{prolog}<commonRoad commonRoadVersion="{version}" '
+        f'<?xml version="1.0"?><commonRoad commonRoadVersion="{version}" '
         f'timeStepSize="{DT}" source="NGSIM test" {attributes}>{body}</commonRoad>'
     )
     return path
@@ -154,17 +151,10 @@ def ngsim_csv(path: Path, rows, *, columns=NGSIM_COLUMNS, sites=None):
 
 
 def table(path: Path, header, rows):
-    """Write a CSV."""
+    """Write a CSV, with its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as handle:
-        writer = csv.writer(handle)
+        writer = csv.writer(handle, lineterminator="\n")
         writer.writerow(header)
         writer.writerows(rows)
-    return path
-
-
-def strict(path: Path, name: str):
-    """The packaged source TOML of a format, by which no row may be bad."""
-    text = (spec_root() / "sources" / f"{name}.toml").read_text()
-    assert "max_bad_rows = 0.01" in text
-    path.write_text(text.replace("max_bad_rows = 0.01", "max_bad_rows = 0.0"))
     return path
