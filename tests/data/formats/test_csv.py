@@ -5,11 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rcirl_jax.data.quality import assumed
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 from tests.data.formats import people
 from tests.data.formats import writers as w
 from tests.data.formats.people import only, read
+from tests.helpers.logs import lanes_of
 
 COLUMNS = ("t", "id", "x", "y", "speed", "length", "width", "lane")
 
@@ -31,18 +33,12 @@ def spec(folder, columns=COLUMNS, **options):
     return people.spec(folder, columns, **options)
 
 
-def test_rows_become_tracks_and_lanes(tmp_path):
+def test_a_column_of_lanes_becomes_lanes(tmp_path):
     recording = only(log(tmp_path), spec(tmp_path))
-    assert [track.id for track in recording.tracks] == ["car0", "car1", "car2"]
-    track = recording.tracks[1]
-    np.testing.assert_allclose(track.x, 10.0 + 1.5 * np.arange(40))
-    np.testing.assert_array_equal(track.speed, 15.0)
-    assert (track.kind, track.length, track.width) == (Kind.VEHICLE, 4.5, 1.8)
-    np.testing.assert_allclose(track.heading, 0.0, atol=1e-9)
-    lanes = {lane.id: lane for lane in recording.lanes}
-    assert (lanes["lane1"].left, lanes["lane1"].right) == ("lane0", "lane2")
-    np.testing.assert_allclose(lanes["lane1"].centre[:, 1], -3.5)
     assert recording.group is None
+    lane = lanes_of(recording)["lane1"]
+    assert (lane.left, lane.right) == ("lane0", "lane2")
+    np.testing.assert_allclose(lane.centre[:, 1], -3.5)
 
 
 KNOTS = (("mph", 0.44704), ("ft/s", 0.3048), ("kn", 1852 / 3600))
@@ -63,15 +59,11 @@ def test_units(tmp_path_factory, length, speed, clock, angle, origin):
     """Every unit, and clocks since 1970, give the same recording in SI."""
     folder = tmp_path_factory.mktemp("units")
     rows = []
-    for row in cars():
-        t, name, x, y, v, box_length, box_width, lane = row
+    for t, name, x, y, v, *box, lane in cars():
         k = round(t / 0.1)
         time = origin + k if clock[0] == "frame" else (origin + 0.1 * k) / clock[1]
-        x, y, box_length, box_width = (
-            value / length[1] for value in (x, y, box_length, box_width)
-        )
-        rows.append([time, name, x, y, v / speed[1], box_length, box_width, lane])
-        rows[-1].append(0.02 / angle[1])
+        x, y, *box = (value / length[1] for value in (x, y, *box))
+        rows.append([time, name, x, y, v / speed[1], *box, lane, 0.02 / angle[1]])
     units = [f'{field} = "{length[0]}"' for field in ("x", "y", "length", "width")]
     units += [f't = "{clock[0]}"', f'speed = "{speed[0]}"', f'heading = "{angle[0]}"']
     columns = (*COLUMNS, "heading")
@@ -111,6 +103,25 @@ def test_reference_point_turned_axis_and_named_kinds(tmp_path, point, shift):
     np.testing.assert_allclose(track.y, -7.0)
     assert track.x[0] == pytest.approx(20.0 + shift)
     assert track.kind == Kind.VEHICLE
+
+
+def test_sizes_and_widths_that_no_cell_says_are_counted(tmp_path):
+    """No column has them, or a cell here and there."""
+    header, rows = people.HEADER, people.rows()
+    bare = people.write(tmp_path, [row[:4] for row in rows], header[:4])
+    made = only(bare, spec(tmp_path, header[:4]))
+    lanes = len(made.lanes)
+    assert tuple(assumed(made).values()) == (lanes, lanes, people.CARS)
+    table = people.column(rows, "length", lambda _: "")
+    table[0][header.index("length")] = 4.5  # of car0, whose width nobody says
+    source = spec(tmp_path, header, more="speed_limit = 13.9\n")
+    made = only(people.write(tmp_path, table), source)
+    assert tuple(assumed(made).values()) == (0, len(made.lanes), people.CARS)
+    assert [track.length for track in made.tracks] == [4.5] * people.CARS
+    header = (*header, "width")
+    table = [[*row, 1.9 if row[1] != "car0" else ""] for row in rows]
+    made = only(people.write(tmp_path, table, header), spec(tmp_path, header))
+    assert assumed(made)["size"] == 1
 
 
 def test_oncoming_lanes_run_the_other_way(tmp_path):

@@ -9,8 +9,6 @@ from tests.data.formats import people
 from tests.data.formats.people import LONG, Way, of, write
 from tests.data.formats.test_csv_ways import degrees
 
-# ------------------------------------------------------------------------ places
-
 
 def test_a_receiver_without_a_fix(tmp_path):
     """It is at (0, 0), in the gulf of Guinea."""
@@ -21,9 +19,6 @@ def test_a_receiver_without_a_fix(tmp_path):
     found = people.only(write(tmp_path, table), source)
     assert people.rows_of(found) == (720, 3, 0, 0)
     assert sum(track.t.size for track in found.tracks) == 717
-
-
-# ------------------------------------------------------------------------- flags
 
 
 FLAGS = [("yes", "no"), ("1.0", "0.0"), ("x", ""), ("ACC", "human"), ("WAHR", "FALSCH"),
@@ -48,9 +43,6 @@ def test_flags(tmp_path, yes, no):
     assert spans == {"car1": ((2.0, math.inf),), **unknown}
 
 
-# -------------------------------------------------------------------------- wide
-
-
 def wide_frames(name, cars=people.CARS):
     """(header, rows): one row per frame; car2 is not seen from 4 to 5 s."""
     header, lines = ["time"], {}
@@ -65,9 +57,9 @@ def wide_frames(name, cars=people.CARS):
 
 def side_by_side(name="{axis}_{car}", columns="{axis}_{id}"):
     """That table, and what its columns mean."""
-    header, table = wide_frames(name)
     fields = {"x": "x", "y": "y", "speed": "v"}
     named = {f: columns.replace("{axis}", axis) for f, axis in fields.items()}
+    header, table = wide_frames(name)
     return of(table, header, columns={"t": "time", **named})
 
 
@@ -84,15 +76,10 @@ def test_one_row_per_frame(tmp_path, name, columns, long_bytes):
     way = side_by_side(name, columns)
     found = people.only(*people.put(tmp_path, way, f"long_bytes = {long_bytes}"))
     assert [t.id for t in found.tracks] == ["0", "1", "2", "2#2", "3", "4", "5"]
-    sizes = {track.id: track.t.size for track in found.tracks}
-    assert (sizes["0"], sizes["2"], sizes["2#2"]) == (120, 40, 70)
-    t, x, y = (
-        np.array([r[k] for r in people.rows() if r[1] == "car3"]) for k in (0, 2, 3)
-    )
-    track = found.tracks[4]
-    np.testing.assert_allclose(track.t, t, atol=1e-9)
-    np.testing.assert_allclose(track.x, x, atol=1e-3)
-    np.testing.assert_allclose(track.y, y, atol=1e-3)
+    assert [t.t.size for t in found.tracks][:4] == [120, 120, 40, 70]
+    track, rows = found.tracks[4], [r for r in people.rows() if r[1] == "car3"]
+    for values, at in ((track.t, 0), (track.x, 2), (track.y, 3)):
+        np.testing.assert_allclose(values, [row[at] for row in rows], atol=1e-3)
     # who is not there is no bad row
     assert people.rows_of(found) == (710, 0, 0, 0)
 
@@ -138,6 +125,3 @@ def test_a_row_per_vehicle_as_in_pneuma(tmp_path, long_bytes):
         np.testing.assert_allclose(track.heading, 0.0, atol=0.01)
         assert np.ptp(track.x) == pytest.approx(np.trapezoid(real, track.t), abs=0.1)
     assert found.rows.read == 570
-
-
-# ---------------------------------------------------------------------- columns

@@ -12,55 +12,49 @@ from tests.data.formats.test_csv_meaning import wide_frames
 from tests.data.formats.test_csv_ways import ISO, degrees, heading_as
 
 
-def moved(**options):
-    """The drive with options that are wrong."""
-    return of(rows(), **options)
+def scaled(name, factor):
+    """The drive with a column in another unit than the TOML says."""
+    return of(column(rows(), name, lambda value: value * factor))
 
 
 def headed(change, **options):
     return of(column(rows(0.5), "heading", change), **options)
 
 
-def scaled(factor, *names):
-    """The drive with columns in another unit than the TOML says."""
-    table = rows()
-    for name in names:
-        table = column(table, name, lambda value: value * factor)
-    return of(table)
-
-
-def side_by_side(**options):
-    header, table = wide_frames("{axis}_{car}")
-    return of(table, header, **options)
-
-
-NUMBERED = [*enumerate(rows())]
 RAD, DEG = 'heading = "rad"', 'heading = "deg"'
 USUAL = 'heading_convention = "ccw_from_x"'
-LAB = (*HEADER[:2], "a", "b", *HEADER[4:])
-LANES = '[[lanes]]\nid = "a"\npoints = [[0.0, 0.0], [9.0, 0.0]]\nspeedlimit = 9.0'
 AUTOMATED = (*HEADER, "automated")
+WIDE, FRAMES = wide_frames("{axis}_{car}")
+IN_FEET = [
+    [*r[:2], *(v / 0.3048 for v in r[2:4]), *r[4:6], r[6] / 0.3048, r[7]]
+    for r in rows()
+]
 REFUSED = {
     "no header? name the columns by names in [table]": Way(
         content=text(rows()).partition("\n")[2]
     ),
     # the layout
-    "table: separator: unknown: expected delimiter": moved(
-        rest='[table]\nseparator = ";"'
+    "table: separator: unknown: expected delimiter": of(
+        rows(), rest='[table]\nseparator = ";"'
     ),
-    "table.delimiter: ab: expected one of tab": moved(rest='[table]\ndelimiter = "ab"'),
+    "table.delimiter: ab: expected one of tab": of(
+        rows(), rest='[table]\ndelimiter = "ab"'
+    ),
     # a row per frame
-    "columns.x: px_{id}: expected columns of this name and of y_{id}": side_by_side(
-        columns={"t": "time", "x": "px_{id}", "y": "y_{id}"}
+    "columns.x: px_{id}: expected columns of this name and of y_{id}": of(
+        FRAMES, WIDE, columns={"t": "time", "x": "px_{id}", "y": "y_{id}"}
     ),
     # columns and lanes
-    "columns.y: missing": moved(columns=("t", "id", "x")),
-    "units.x: yard": moved(units='x = "yard"'),
+    "columns.y: missing": of(rows(), columns=("t", "id", "x")),
+    "columns.x: id: expected a column of numbers": of(
+        rows(), columns={"t": "t", "id": "id", "x": "id", "y": "y"}
+    ),
+    "units.x: yard": of(rows(), units='x = "yard"'),
     # units and numbers that no road user has
-    "feet taken for metres": scaled(1 / 0.3048, "x", "y", "length"),
-    "km/h taken for m/s": scaled(3.6, "speed"),
-    "t: median step 1: expected at most 0.55": scaled(10.0, "t"),
-    "t: median step 0.2 s: expected 0.1 s": scaled(2.0, "t"),
+    "feet taken for metres": of(IN_FEET),
+    "km/h taken for m/s": scaled("speed", 3.6),
+    "t: median step 1: expected at most 0.55": scaled("t", 10.0),
+    "t: median step 0.2 s: expected 0.1 s": scaled("t", 2.0),
     # times
     "units.t: ms: the cells of t are such as '2024-05-20T10:00:00.000'": of(
         column(rows(), "t", ISO["ISO"]), units='t = "ms"'
@@ -75,7 +69,7 @@ REFUSED = {
         heading_as("cw_from_north", "deg"), units=DEG, more=USUAL
     ),
     # options that nobody reads
-    "did you mean speed_limit?": moved(more="speedlimit = 20.0"),
+    "did you mean speed_limit?": of(rows(), more="speedlimit = 20.0"),
     # flags
     "automated: 'L0': expected yes or no; automated_values of the source": of(
         [[*row, "L0"] for row in rows()], AUTOMATED
@@ -143,40 +137,27 @@ def test_a_mirrored_compass_is_refused(tmp_path):
 
 
 CURVE = 0.785 + 0.2 * np.sin(np.arange(120) / 40.0)  # rad, direction of travel
+TURNING = {
+    "ccw_from_x": lambda h: np.rad2deg(h),
+    "cw_from_north": lambda h: 90.0 - np.rad2deg(h),
+}
 
 
-def curved(folder, convention):
-    """Cars in a slight curve about 45 degrees, where compass and mathematics agree."""
-    sign, zero = {"ccw": (1.0, 0.0), "cw": (-1.0, 90.0)}[convention]
-    table, places = [], {}
-    for k in range(120):
-        turn = CURVE[k]
-        for car in range(4):
-            x, y = places.get(car, (0.0, 40.0 * car))
-            table.append([0.1 * k, f"c{car}", x, y, sign * np.rad2deg(turn) + zero])
-            places[car] = x + 1.5 * np.cos(turn), y + 1.5 * np.sin(turn)
-    return people.write(folder, table, people.HEADER[:5])
-
-
-@pytest.mark.parametrize("convention", ["ccw", "cw"])
+@pytest.mark.parametrize("convention", TURNING)
 def test_headings_must_turn_as_the_motion_does(tmp_path, convention):
-    """The median offset is small both ways; the turns in the curve tell."""
-    path = curved(tmp_path, convention)
-    names = {"ccw": "ccw_from_x", "cw": "cw_from_north"}
-    units, columns = 'heading = "deg"', people.HEADER[:5]
-    for own, name in names.items():
-        source = people.spec(
-            tmp_path, columns, units, more=f'heading_convention = "{name}"'
-        )
-        if own == convention:
-            (made,) = people.read(path, source)
-            off = made.tracks[0].heading - CURVE
-            assert np.abs(off).max() < 0.02
-            continue
-        with pytest.raises(InputError, match="in curves it turns against") as caught:
-            people.read(path, source)
-        hint = f'"{names[convention]}" with units.heading = "deg" fits'
-        assert hint in str(caught.value)
-    (made,) = people.read(path, people.spec(tmp_path, columns, units))
-    off = made.tracks[0].heading - CURVE
-    assert np.abs(off).max() < 0.02
+    """In a slight curve about 45 degrees the median offset is small both ways."""
+    x, y = (np.cumsum(1.5 * f(CURVE)) for f in (np.cos, np.sin))
+    columns = [0.1 * np.arange(120), x, y, TURNING[convention](CURVE)]
+    header, units = ("t", "x", "y", "heading", "id"), 'heading = "deg"'
+    table = [[*row, "c"] for row in np.stack(columns, axis=1).tolist()]
+    path = people.write(tmp_path, table, header)
+    for name in (*TURNING, ""):
+        more = f'heading_convention = "{name}"' if name else ""
+        source = people.spec(tmp_path, header, units, more)
+        if name in (convention, ""):
+            heading = people.only(path, source).tracks[0].heading
+            np.testing.assert_allclose(heading, CURVE, atol=0.02)
+        else:
+            line = refused(path, source)
+            assert "in curves it turns against" in line
+            assert f'"{convention}" with units.heading = "deg" fits' in line

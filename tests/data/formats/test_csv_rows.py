@@ -10,14 +10,9 @@ from rcirl_jax.data.importing import import_logs
 from rcirl_jax.data.inputs import input_files
 from rcirl_jax.data.quality import format_quality
 from tests.data.formats import people
+from tests.data.formats.fixtures import has_note
 from tests.data.formats.people import LONG, refused, write
 from tests.data.small_logs import CONFIG
-
-
-def with_cell(row, name, value):
-    table = people.rows()
-    table[row][people.HEADER.index(name)] = value
-    return table
 
 
 @LONG
@@ -35,12 +30,14 @@ def with_cell(row, name, value):
     ],
 )
 def test_a_bad_row_is_dropped_or_named(tmp_path, name, value, words, long_bytes):
-    path = write(tmp_path, with_cell(10, name, value))
+    table = people.rows()
+    table[10][people.HEADER.index(name)] = value
+    path = write(tmp_path, table)
     more = f"long_bytes = {long_bytes}\n"
     found = people.only(path, people.spec(tmp_path, more=more))
     assert people.rows_of(found) == (720, 1, 0, 0)
     assert sum(track.t.size for track in found.tracks) == 719
-    assert any(f"1 unreadable rows dropped; first: {words}" in n for n in found.notes)
+    assert has_note(found, f"1 unreadable rows dropped; first: {words}")
     line = refused(path, people.spec(tmp_path, more=more + "max_bad_rows = 0.0"))
     assert words in line
     assert line.endswith(
@@ -77,10 +74,7 @@ def test_a_road_user_in_two_places_at_once(tmp_path, long_bytes):
     found = people.only(write(tmp_path, table), source)
     people.assert_same(found)
     assert people.rows_of(found) == (723, 0, 0, 3)
-    assert any(
-        "3 rows of a road user twice in one frame, one used; first: line" in note
-        for note in found.notes
-    )
+    assert has_note(found, "3 rows of a road user twice in one frame, one used; first")
 
 
 @LONG
@@ -96,8 +90,6 @@ def test_an_import_counts_what_it_dropped(tmp_path, long_bytes):
     assert "rows dropped: 2 of 721 (0.28%): 1 unreadable, 1 repeated" in said
     assert any("line 7: x: 'west'" in note for note in manifest.quality["notes"])
 
-
-# ----------------------------------------------------- places, ids and clocks
 
 X, T, LENGTH = (people.HEADER.index(name) for name in ("x", "t", "length"))
 
@@ -130,7 +122,7 @@ def test_a_place_far_away_for_a_moment_is_dropped(tmp_path, place, long_bytes):
         own = [people.rows()[6 * k + car][X] for k in kept]
         np.testing.assert_allclose(track.x, own, atol=0.002)
     assert people.rows_of(found) == (720, 4, 0, 0)
-    assert any("line 102: id car4: x, y: " in note for note in found.notes)
+    assert has_note(found, "line 102: id car4: x, y: ")
 
 
 @LONG

@@ -13,11 +13,10 @@ from rcirl_jax.data.store.dataset import open_dataset
 from tests.data.small_logs import CONFIG
 from tests.helpers.commands import count_and_peak
 
-SECONDS = 200.0
 LANES = [{"id": "a", "points": [[-50.0, 0.0], [1800.0, 0.0]], "width": 4.0}]
 
 
-def rows_of(shuffled=False, seconds=SECONDS, cars=24):
+def rows_of(by_car=False, seconds=200.0, cars=24):
     """Cars that enter a straight road one after the other; (t, id, x, y)."""
     t = np.arange(0.0, seconds, 0.1)
     found = []
@@ -28,19 +27,18 @@ def rows_of(shuffled=False, seconds=SECONDS, cars=24):
         speed = 11.0 + 2.0 * np.sin(0.35 * own + phase)
         x = np.cumsum(speed) * 0.1
         y = 0.4 * np.sin(x / 25.0)
+        part = np.stack([own, np.full(own.shape, car), x, y], axis=1)
         if car % 3 == 0:  # unseen for three seconds, another fragment
-            seen = (own < begin + 40.0) | (own > begin + 43.0)
-            own, x, y = own[seen], x[seen], y[seen]
-        found.append(np.stack([own, np.full(own.shape, car), x, y], axis=1))
+            part = part[(own < begin + 40.0) | (own > begin + 43.0)]
+        found.append(part)
     rows = np.concatenate(found)
-    if not shuffled:
-        return rows[np.lexsort((rows[:, 1], rows[:, 0]))]
-    return rows  # by car: each minute is met again and again
+    # by car each minute is met again and again
+    return rows if by_car else rows[np.lexsort((rows[:, 1], rows[:, 0]))]
 
 
-def write(path, rows, extra=""):
+def write(path, rows):
     lines = ["t,id,x,y"] + [f"{t:.1f},c{i:.0f},{x:.3f},{y:.3f}" for t, i, x, y in rows]
-    path.write_text("\n".join(lines) + "\n" + extra)
+    path.write_text("\n".join(lines) + "\n")
     _, spec = parts("csv", path)
     return {**spec, "lanes": LANES}
 
@@ -73,17 +71,15 @@ def assert_same_scenes(apart, whole, leaves=("s", "v", "a"), atol=2e-2):
 def test_pieces_hold_the_scenes_of_the_whole(tmp_path, by_car):
     path = tmp_path / "log.csv"
     spec = write(path, rows_of(by_car))
-    whole = scenes_by_name(cuts(path, spec))
+    (one,) = cuts(path, spec)
     pieces = cuts(path, {**spec, "long_bytes": 1})
     assert [made.name for made in pieces] == [f"log-{k:05d}" for k in range(4)]
-    apart = scenes_by_name(pieces)
+    whole, apart = scenes_by_name([one]), scenes_by_name(pieces)
     assert len(whole) > 500
     assert_same_scenes(apart, whole)
     assert any("#2" in name for name, _ in whole)
-    sums_of = lambda made: (made.quality["tracks"], made.quality["states"])  # noqa: E731
-    (one,) = cuts(path, spec)
-    totals = np.sum([sums_of(made) for made in pieces], axis=0)
-    assert tuple(totals) == sums_of(one)
+    for count in ("tracks", "states"):
+        assert sum(made.quality[count] for made in pieces) == one.quality[count]
     for reason in ("future_too_short", "off_map"):
         found = sum(made.quality["dropped"].get(reason, 0) for made in pieces)
         assert found == one.quality["dropped"].get(reason, 0)

@@ -9,7 +9,6 @@ import pytest
 
 from rcirl_jax.data.formats.csv.names import fields_by_name, unit_of
 from rcirl_jax.data.formats.csv.suggest import suggested
-from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml
 from tests.data.formats import people
 from tests.data.formats.test_csv_rows import digits
@@ -53,9 +52,7 @@ def test_a_german_table_of_a_spreadsheet(tmp_path):
     assert toml["defaults"]["rate_hz"] == 10.0
     assert toml["heading_convention"] == "cw_from_north"
     assert toml["kinds"] == {"Lkw": "vehicle", "Pkw": "vehicle"}
-    said = "\n".join(found.lines)
-    assert "text in utf-16, semicolon between cells, decimal comma" in said
-    assert "not known: width: no column" in said
+    assert "not known: width: no column" in "\n".join(found.lines)
     shown = found.lines[found.lines.index("the first rows as understood:") + 1 :]
     assert len(shown) == 6
     heads = "t [s] id x [m] y [m] heading [deg] speed [m/s] length [m] kind"
@@ -127,14 +124,27 @@ TOOLS = {
     "German": "Zeitstempel=t Fahrzeug=id Rechtswert_m=x Hochwert_m=y "
     "Fahrzeuglänge=length Fahrzeugbreite=width Fahrzeugklasse=kind Fahrstreifen=lane",
 }
+PLACES = [
+    # pixels and points that are no middle come last
+    "frame id carCenterX carCenterY headXft headYft carCenterXft=x carCenterYft=y",
+    *("frame id x_px y_px x_m=x y_m=y", "frame id xpixel ypixel east=x north=y"),
+    # names of the compass count before the letters; the last are estimates
+    *("Czas Nr Północ_X=y Wschód_Y=x", "t id Hochwert=y Rechtswert=x", "t id N=y E=x"),
+    *("t id Norte=y Leste=x", "t id X_sever=y Y_vychod=x", "t id x_est=x y_est=y"),
+]
 
 
-@pytest.mark.parametrize("name", TOOLS)
-def test_fields_by_names_of_known_tools(name):
-    pairs = [word.partition("=") for word in TOOLS[name].split()]
+@pytest.mark.parametrize("names", [*TOOLS.values(), *PLACES])
+def test_fields_by_names(names):
+    pairs = [word.partition("=") for word in names.split()]
     found = fields_by_name([column for column, _, _ in pairs])
     for column, _, field in pairs:
         assert not field or found.get(field) == column
+
+
+def test_units_by_names():
+    units = {"carCenterXft": "ft", "x_m": "m", "east": ""}
+    assert {name: unit_of(name, ("m", "ft")) for name in units} == units
 
 
 def test_by_its_command(tmp_path):
@@ -153,23 +163,6 @@ def test_by_its_command(tmp_path):
     )
     done = command("rcirl_jax", "import", "--suggest=nowhere.csv")
     assert done.stderr == "error: nowhere.csv: --suggest: missing: expected a table\n"
-    done = command("rcirl_jax", "import", "--format=csv")
-    assert done.stderr.startswith("error: --output: not given: expected")
-
-
-@pytest.mark.parametrize(
-    ("header", "x", "unit"),
-    [
-        ("carCenterX carCenterY headXft headYft carCenterXft carCenterYft",
-         "carCenterXft", "ft"),
-        ("x_px y_px x_m y_m", "x_m", "m"),
-        ("xpixel ypixel east north", "east", ""),
-    ],
-)  # fmt: skip
-def test_pixels_and_points_that_are_no_middle_come_last(header, x, unit):
-    names = ["frame", "id", *header.split()]
-    assert fields_by_name(names)["x"] == x
-    assert unit_of(x, ("m", "ft")) == unit
 
 
 @pytest.mark.parametrize(
@@ -200,18 +193,13 @@ def strange(folder, *, units=True, header=STRANGE, drop=()):
             way = (14.0 + car) * at - (np.cos(0.3 * at + car) - np.cos(car)) / 0.3
             h = 0.4 + way / 300.0
             x, y = 300.0 * np.sin(h), -300.0 * np.cos(h)
-            table.append([at, 7 + 3 * car, x, y, 90.0 - np.rad2deg(h), 3.6 * v])
-            table[-1] += [
-                4.4 + 0.1 * car,
-                "truck" if car == 4 else "car",
-                1.7 + 0.05 * car,
-            ]
-    rows = [
-        *([["s", "-", "m", "m", "°", "km/h", "m", "-", "m"]] if units else []),
-        *table,
-    ]
+            box = [4.4 + 0.1 * car, "truck" if car == 4 else "car", 1.7 + 0.05 * car]
+            motion = [90.0 - np.rad2deg(h), 3.6 * v]
+            table.append([at, 7 + 3 * car, x, y, *motion, *box])
+    if units:
+        table.insert(0, ["s", "-", "m", "m", "°", "km/h", "m", "-", "m"])
     kept = [n for n, name in enumerate(STRANGE) if name not in drop]
-    rows = [[row[n] for n in kept] for row in rows]
+    rows = [[row[n] for n in kept] for row in table]
     return people.write(folder, rows, [header[n] for n in kept], between=";")
 
 
@@ -226,10 +214,7 @@ def test_by_content_where_names_say_nothing(tmp_path, is_stated):
     assert toml["heading_convention"] == "cw_from_north"
     assert sorted(track.id for track in made.tracks) == ["10", "13", "16", "19", "7"]
     assert 't = "qa"  # guessed: rises in steps of 0.1 within one qb' in found.toml
-    assert 'id = "qb"  # guessed: 5 values, each once at one qa' in found.toml
-    assert found.toml.count("# guessed: the motion fits qf") == 2
     assert found.toml.count("which of the two is x is a guess") == 2
-    assert "(guessed: the same within one qb, 4.6 m in the median)" in str(found.lines)
     assert not found.last
 
 
@@ -245,19 +230,14 @@ def test_one_unknown_name_among_known_ones(tmp_path, field):
 def test_what_nothing_tells_is_left_open(tmp_path):
     """Without a clock: the draft names the columns, and an import refuses it."""
     path = strange(tmp_path, drop=("qa",), header=[*STRANGE[:1], "id", *STRANGE[2:]])
-    source = tmp_path / "draft.toml"
-    done = command("rcirl_jax", "import", f"--suggest={path}", f"--output={source}")
-    assert done.returncode == 0, done.stderr
+    found, source = suggested(path), tmp_path / "draft.toml"
+    source.write_text(found.toml)
     columns = load_toml(source)["columns"]
     assert (columns["t"], columns["id"]) == ("?", "id")
-    assert 't = "?"  # one of: qc, ' in source.read_text()
-    assert "not known: t: one of: qc, " in done.stdout
-    last = done.stdout.splitlines()[-1]
-    assert last.startswith('fill in the lines with "?" before you import; words ')
-    with pytest.raises(
-        InputError, match=r"columns\.t: \?: expected the name of a colu"
-    ):
-        people.read(path, source)
+    assert 't = "?"  # one of: qc, ' in found.toml
+    assert any(line.startswith("not known: t: one of: qc, ") for line in found.lines)
+    assert found.last.startswith('fill in the lines with "?" before you import; words ')
+    assert "columns.t: ?: expected the name of a colu" in people.refused(path, source)
 
 
 # the same header as firms of several countries write it
@@ -279,20 +259,3 @@ def test_words_of_names_tell_the_encoding(tmp_path, encoding):
     assert toml.get("table", {}).get("encoding", "utf-8") == encoding
     assert "a guess" not in found.toml
     assert len(made.tracks) == 5
-
-
-@pytest.mark.parametrize(
-    ("header", "x"),
-    [
-        ("Czas Nr Północ_X Wschód_Y", "Wschód_Y"),
-        ("t id Hochwert Rechtswert", "Rechtswert"),
-        ("t id N E", "E"),
-        ("t id Norte Leste", "Leste"),
-        ("t id X_sever Y_vychod", "Y_vychod"),
-        ("t id x_est y_est", "x_est"),  # estimated
-    ],
-)
-def test_names_of_the_compass_count_before_the_letters(header, x):
-    found = fields_by_name(header.split())
-    assert found["x"] == x
-    assert found["y"] in {*header.split()[2:]} - {x}

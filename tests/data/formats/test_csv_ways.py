@@ -89,30 +89,19 @@ LAYOUTS = {
     "remarks of several lines": remarks(),
     "no newline at the end": text(rows()).rstrip("\n"),
 }  # fmt: skip
-GERMAN = ("Zeit", *HEADER[1:6], "Länge", "kind")
-NAMED = {**{c: c for c in HEADER}, "t": "Zeit", "length": "Länge"}
+ENCODINGS = {
+    **dict.fromkeys(("utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"), "Länge"),
+    # names that the source TOML says tell encodings apart
+    **{"cp1252": "Longueur à", "cp1250": "Długość", "cp1251": "Длина"},
+    **{"cp1253": "Μήκος", "cp1254": "Uzunluğu ş", "shift_jis": "長さ"},
+    "gb18030": "长度",
+}
 ENCODED = {
     encoding: Way(
-        content=text(rows(), GERMAN, between=";").encode(encoding), columns=NAMED
-    )
-    for encoding in ("utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "cp1252")
-}
-# names that the source TOML says tell encodings apart
-FOREIGN = {
-    **{
-        "cp1252": "Longueur à",
-        "cp1250": "Długość",
-        "cp1251": "Длина",
-        "cp1253": "Μήκος",
-    },
-    **{"cp1254": "Uzunluğu ş", "shift_jis": "長さ", "gb18030": "长度"},
-}
-ENCODED |= {
-    f"{encoding} by its names": Way(
         content=text(rows(), (*HEADER[:6], name, "kind"), between=";").encode(encoding),
         columns={**{c: c for c in HEADER}, "length": name},
     )
-    for encoding, name in FOREIGN.items()
+    for encoding, name in ENCODINGS.items()
 }
 NAMES = f"names = {list(HEADER)}".replace("'", '"')
 # what the TOML says wins
@@ -165,12 +154,9 @@ def stored(write, **changed):
     return out.getvalue()
 
 
-STAMPS = [
-    datetime.datetime(2024, 5, 20, 10, tzinfo=datetime.UTC)
-    + datetime.timedelta(milliseconds=round(1000 * t))
-    for t in cells_of("t")
-]
-NAIVE = [stamp.replace(tzinfo=None) for stamp in STAMPS]
+BEGIN = datetime.datetime(2024, 5, 20, 10)
+NAIVE = [BEGIN + datetime.timedelta(seconds=round(t, 3)) for t in cells_of("t")]
+STAMPS = [stamp.replace(tzinfo=datetime.UTC) for stamp in NAIVE]
 TYPES = {
     "as they are": {},
     "texts as categories": {
@@ -311,24 +297,20 @@ def heading_as(convention, unit):
     return lambda h: f"{(sign * (h - zero)) % (2.0 * math.pi) * factor:.4f}"
 
 
-def headed(convention, unit, turn, more=""):
-    table = column(rows(turn), "heading", heading_as(convention, unit))
-    units = f'heading = "{unit}"' if more is not None else ""
+def headed(convention, unit, said):
+    table = column(rows(-2.0), "heading", heading_as(convention, unit))
+    more = f'heading_convention = "{convention}"' if said == "all" else ""
+    units = "" if said == "nothing" else f'heading = "{unit}"'
     is_usual = more or convention == "ccw_from_x"
     note = "" if is_usual else f"headings read as {convention}"
-    return of(table, turn=turn, units=units, more=more or "", note=note)
+    return of(table, turn=-2.0, units=units, more=more, note=note)
 
 
 HEADINGS = {
-    f"{convention} {unit} {turn} {said}": headed(convention, unit, turn, more)
+    f"{convention} {unit}, {said} said": headed(convention, unit, said)
     for convention in CONVENTIONS
     for unit in ("rad", "deg")
-    for turn in (-2.0,)
-    for said, more in (
-        ("unit said", ""),
-        ("nothing said", None),
-        ("all said", f'heading_convention = "{convention}"'),
-    )
+    for said in ("nothing", "unit", "all")
 }
 VELOCITY = (*HEADER[:4], "vx", "vy", *HEADER[6:])
 
