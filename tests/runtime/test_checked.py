@@ -44,7 +44,6 @@ def test_a_body_that_fits_keeps_its_values():
     ("body", "line"),
     [
         (3, "3: expected an object"),
-        ({}, "count: missing: expected a value"),
         ({"count": "3"}, "count: 3: expected a whole number"),
         ({"count": 1, "parts": [{}]}, "parts[0].shares: missing: expected a value"),
         (
@@ -106,7 +105,6 @@ def test_values_get_the_types_of_their_fields():
     [
         ({"flag": 1}, "flag: 1: expected true or false"),
         ({"count": 2**31}, "count: 2147483648: expected numbers between"),
-        ({"rate": float("nan")}, "rate: nan: expected numbers between"),
         ({"pairs": [[1, 2], [3]]}, "pairs: [1]: [3]: expected a list of length 2"),
         ({"inner": {"sizes": [[]]}}, "inner.sizes: [0]: []: expected a whole number"),
         ({"inner": {"size": []}}, "inner.size: unknown: expected some of sizes; did"),
