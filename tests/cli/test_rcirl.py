@@ -15,7 +15,7 @@ from rcirl_jax.cli.flags import left_out
 from rcirl_jax.cli.rcirl import COMMANDS, overview
 from rcirl_jax.errors import InputError
 from rcirl_jax.tuning.recipes import DEFAULT, load_recipe
-from tests.helpers.commands import command, refused, succeeded
+from tests.helpers.commands import command, python, refused, succeeded
 
 LINES, COLUMNS = 40, 100  # of a screen
 FLAG = re.compile(r"^  --(?:\[no\])?([a-z_0-9]+)", re.M)
@@ -72,9 +72,7 @@ print(json.dumps(found))
 @pytest.fixture(scope="module")
 def every():
     """Command -> what --help and --helpfull say, and what is said without flags."""
-    done = subprocess.run(
-        [sys.executable, "-c", EVERY], capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    done = python(EVERY)
     assert done.returncode == 0, done.stderr[-2000:]
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -88,44 +86,6 @@ def test_the_overview_fits_and_names_every_command():
     assert fits(overview())
     for name, (_, line) in COMMANDS.items():
         assert f"  {name:16}{line}" in overview()
-
-
-# A command of our own that prints more than a buffer holds
-PRINTS = """
-from rcirl_jax.cli import running
-def main():
-    print("x" * 100_000)
-running.run(main)
-"""
-
-
-@pytest.mark.parametrize(
-    ("words", "joined"),
-    [(["-m", "rcirl_jax", "train", "--helpfull"], False), (["-c", PRINTS], True)],
-    ids=["help", "main"],
-)
-def test_output_that_nobody_reads_ends_without_a_word(words, joined):
-    """As behind `| head`; what is written is more than a buffer holds."""
-    unread, output = os.pipe()
-    os.close(unread)
-    done = subprocess.run(
-        [sys.executable, *words],
-        stdout=output, stderr=output if joined else subprocess.PIPE, check=False,
-    )  # fmt: skip
-    os.close(output)
-    assert (done.returncode, done.stderr or b"") == (128 + signal.SIGPIPE, b"")
-
-
-def test_output_without_room_is_one_line():
-    with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            [sys.executable, "-c", PRINTS],
-            stdout=full, stderr=subprocess.PIPE, text=True, check=False,
-        )  # fmt: skip
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
-    assert line.startswith("error: ")
-    assert "No space left on device" in line
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -182,23 +142,15 @@ def test_a_wrong_command_is_one_line(words, message, tmp_path):
 
 
 @pytest.mark.multiprocess
-@pytest.mark.parametrize("flag", ["only_check_args", "helpxml"])
-def test_no_flag_of_absl_ends_a_gate_before_its_verdict(flag, tmp_path):
+def test_no_flag_of_absl_ends_a_gate_before_its_verdict(tmp_path):
     """Also from a file: status 0 of a gate means "ship" and nothing else."""
-    (tmp_path / "flags").write_text(f"--{flag}\n")
+    (tmp_path / "flags").write_text("--helpxml\n")
     given = ("gate", "--candidate=none", f"--output={tmp_path}/verdict.json")
-    for last in (f"--{flag}", f"--flagfile={tmp_path}/flags"):
+    for flag, last in (
+        ("only_check_args", "--only_check_args"),
+        ("helpxml", f"--flagfile={tmp_path}/flags"),
+    ):
         assert f"--{flag}=true: expected a flag" in refused("rcirl_jax", *given, last)
-
-
-@pytest.mark.multiprocess
-def test_logs_of_no_known_format_are_one_line_with_the_formats(tmp_path):
-    (tmp_path / "drive.log").write_bytes(b"\x00\x01")
-    for words in ("import", "autotune"):
-        flags = (f"--input={tmp_path}", f"--output={tmp_path}/out")
-        line = refused("rcirl_jax", words, *flags)
-        assert f"{tmp_path}: format: not given" in line
-        assert "apollo, argoverse2" in line
 
 
 @pytest.mark.multiprocess
@@ -208,18 +160,44 @@ def test_the_package_is_the_command():
     assert succeeded("rcirl_jax", "--version").stdout.strip().endswith(__version__)
 
 
+# A command of our own
 MAIN = """
 from rcirl_jax.cli.running import run
 def main():
-    raise ZeroDivisionError("scene 7")
+    {}
 run(main)
 """
+PRINTS = MAIN.format('print("x" * 100_000)')  # more than a buffer holds
+
+
+@pytest.mark.parametrize(
+    ("words", "joined"),
+    [(["-m", "rcirl_jax", "train", "--helpfull"], False), (["-c", PRINTS], True)],
+    ids=["help", "main"],
+)
+def test_output_that_nobody_reads_ends_without_a_word(words, joined):
+    """As behind `| head`."""
+    unread, output = os.pipe()
+    os.close(unread)
+    done = subprocess.run(
+        [sys.executable, *words],
+        stdout=output, stderr=output if joined else subprocess.PIPE, check=False,
+    )  # fmt: skip
+    os.close(output)
+    assert (done.returncode, done.stderr or b"") == (128 + signal.SIGPIPE, b"")
+
+
+def test_output_without_room_is_one_line():
+    with Path("/dev/full").open("w") as full:
+        done = python(PRINTS, capture_output=False, stdout=full, stderr=subprocess.PIPE)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert "No space left on device" in line
 
 
 def test_a_fault_is_a_traceback_and_a_line_on_reporting_it():
-    done = subprocess.run(
-        [sys.executable, "-c", MAIN], capture_output=True, text=True, check=False
-    )
+    done = python(MAIN.format('raise ZeroDivisionError("scene 7")'))
     assert done.returncode == 70
     *above, said = done.stderr.splitlines()
     assert above[0].startswith("Traceback")
@@ -227,18 +205,9 @@ def test_a_fault_is_a_traceback_and_a_line_on_reporting_it():
     assert said.startswith("error: this is a fault of rcirl-jax, not of your input")
 
 
-WITHOUT = """
-from rcirl_jax.cli.running import run
-def main():
-    raise ModuleNotFoundError("none", name="matplotlib.axes")
-run(main)
-"""
-
-
 def test_a_missing_extra_is_one_line_that_names_it():
-    done = subprocess.run(
-        [sys.executable, "-c", WITHOUT], capture_output=True, text=True, check=False
-    )
+    missing = 'raise ModuleNotFoundError("none", name="matplotlib.axes")'
+    done = python(MAIN.format(missing))
     assert done.returncode == 2
     line = "error: matplotlib: not installed: expected pip install 'rcirl-jax[report]'"
     assert done.stderr.strip() == line

@@ -100,6 +100,14 @@ def fresh(module, *flags, compiler=QUICKLY):
     )  # fmt: skip
 
 
+def python(code, *arguments, **more):
+    """A finished interpreter that ran this code, and what it said."""
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        **{"capture_output": True, "text": True, "check": False, **more},
+    )
+
+
 def _environment(compiler=QUICKLY):
     env = {**os.environ, "JAX_PLATFORMS": "cpu"}
     env.pop("PYTEST_CURRENT_TEST", None)

@@ -2,39 +2,33 @@
 
 import types
 
+import pytest
+
 from rcirl_jax.tuning import loop
 
 NAMES = ("import", "demonstrate", "train", "rank")
 WORK = {"demonstrate": 60.0, "train": 120.0, "rank": 60.0}
 
 
-class Time:
-    now = 100.0
-
-    def monotonic(self):
-        return self.now
-
-
-def a_run(*finished):
-    """What the clock reads of a run of which an earlier process has finished stages."""
-    return types.SimpleNamespace(
-        said=[],
-        done=[],
-        stages=types.SimpleNamespace(read=lambda: dict.fromkeys(finished)),
-    )
+@pytest.fixture
+def time(monkeypatch):
+    """The clock of the loop, which stands still."""
+    made = types.SimpleNamespace(now=100.0)
+    made.monotonic = lambda: made.now
+    monkeypatch.setattr(loop, "time", made)
+    return made
 
 
-def begun(run, monkeypatch):
-    time = Time()
-    monkeypatch.setattr(loop, "time", time)
+def clock_of(*finished):
+    """A run of which an earlier process has finished stages, and its clock."""
+    run = types.SimpleNamespace(said=[], done=[], compiled=[])
     run.say = run.said.append
-    run.compiled = []
-    return time, loop.Clock(run, NAMES, run.compiled)
+    run.stages = types.SimpleNamespace(read=lambda: dict.fromkeys(finished))
+    return run, loop.Clock(run, NAMES, run.compiled)
 
 
-def test_the_time_left_grows_with_what_is_not_compiled(monkeypatch):
-    run = a_run()
-    time, clock = begun(run, monkeypatch)
+def test_the_time_left_grows_with_what_is_not_compiled(time):
+    run, clock = clock_of()
     for name, work, took, compiled in (
         ("import", None, 30.0, 0.0),
         ("demonstrate", WORK, 300.0, 120.0),  # of the rest 60 s are usual, 120 s more
@@ -54,9 +48,8 @@ def test_the_time_left_grows_with_what_is_not_compiled(monkeypatch):
     ]
 
 
-def test_stages_of_an_earlier_run_take_no_time_until_something_changes(monkeypatch):
-    run = a_run("demonstrate", "export")
-    time, clock = begun(run, monkeypatch)
+def test_stages_of_an_earlier_run_take_no_time_until_something_changes(time):
+    run, clock = clock_of("demonstrate", "export")
     clock.begin("demonstrate", WORK)
     assert " about 1 min left" in run.said[-1]
     time.now += WORK["demonstrate"]
