@@ -12,11 +12,11 @@ from rcirl_jax.data.quality import format_quality, format_splits
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.rows import check_finite
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, LostWorkError
 from rcirl_jax.types import Kind
 from tests.data.small_logs import files_of
 from tests.helpers.logs import refused
-from tests.helpers.roads import NO_FILTER, SERIES, car, recording, speeding_up
+from tests.helpers.roads import NO_FILTER, car, part, recording, speeding_up
 
 CONFIG = ImportConfig(format="test", collect=NO_FILTER, test_fraction=0.4)
 
@@ -47,14 +47,17 @@ def ending(recordings, error):
 
 
 @pytest.mark.usefixtures("small_shards")
-def test_an_interrupted_import_resumes_to_the_same_bytes(tmp_path, three):
+@pytest.mark.parametrize("error", [KeyboardInterrupt, LostWorkError("log: killed")])
+def test_an_interrupted_import_resumes_to_the_same_bytes(tmp_path, three, error):
     """Names, quality and numbers go on; other settings or recordings are refused."""
     part, out = tmp_path / "part", tmp_path / "whole"
     import_logs(three, out, CONFIG)
-    with pytest.raises(KeyboardInterrupt):
-        import_logs(ending(three[:2], KeyboardInterrupt), part, CONFIG)
+    with pytest.raises((KeyboardInterrupt, LostWorkError)):
+        import_logs(ending(three[:2], error), part, CONFIG)
     assert "interrupted" in refused(open_dataset, part)
     left = files_of(part)
+    kept = {path: path.stat().st_mtime_ns for path in part.rglob("shard.json")}
+    assert kept
     wider = dataclasses.replace(NO_FILTER, stride_s=1.0)
     other = dataclasses.replace(CONFIG, collect=wider)
     for recordings, config, words in (
@@ -66,6 +69,7 @@ def test_an_interrupted_import_resumes_to_the_same_bytes(tmp_path, three):
         assert files_of(part) == left
     import_logs(three, part, CONFIG)
     assert files_of(part) == files_of(out)
+    assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
 
 
 @pytest.mark.usefixtures("small_shards")
@@ -93,17 +97,11 @@ def test_a_recording_without_traffic_is_counted_and_skipped(tmp_path, three):
     assert not (tmp_path / "none").exists()
 
 
-def late(track, since):
-    """The track's samples from `since` s on."""
-    keep = track.t >= since - 1e-6
-    return dataclasses.replace(track, **{k: getattr(track, k)[keep] for k in SERIES})
-
-
 @pytest.mark.parametrize("group", [None, "declared"])
 def test_one_recording_is_split_by_when_vehicles_are_first_seen(tmp_path, group):
     one = car("one", speeding_up(0.0, 10.0), seconds=20.0)
     two = car("two", speeding_up(60.0, 10.0), seconds=20.0)
-    three = late(car("three", speeding_up(30.0, 10.0), seconds=20.0), 4.0)
+    three = part(car("three", speeding_up(30.0, 10.0), seconds=20.0), 4.0)
     made = dataclasses.replace(recording(one, two, three), group=group)
     import_logs([validate_recording(made)], tmp_path / "data", CONFIG)
     dataset = open_dataset(tmp_path / "data")
@@ -113,24 +111,17 @@ def test_one_recording_is_split_by_when_vehicles_are_first_seen(tmp_path, group)
         for split in ("train", "test")
     }
     assert driven == {"train": {"one", "two"}, "test": {"three"}}
-    told = format_splits(dataset)
-    assert "split by                    blocks of 3.75 s in which" in told
-    assert told.index("split train") < told.index("split test")
-    scenes = dataset.indices("test").size
-    assert re.search(
-        rf"split test +{scenes} scenes \(.*%\) in 1 group of vehicles; .*", told, re.M
-    )
-    assert "40.0% of the scenes were asked for in test" in told
+    told, scenes = format_splits(dataset), dataset.indices("test").size
+    assert re.search(r"split by +blocks of 3.75 s", told)
+    assert re.search(rf"split test +{scenes} scenes \(.*%\) in 1 group of", told)
 
 
 def test_an_empty_split_is_refused_and_what_is_finished_stays(tmp_path):
     bike = car("bike", speeding_up(30.0), kind=Kind.CYCLIST)
     alone = recording(car("only", speeding_up(0.0)), bike)
     line = refused(import_logs, [alone], tmp_path / "data", CONFIG)
-    assert line == (
-        "splits: groups: 1 (hand/minute-0000): expected at least two vehicle-disjoint "
-        "groups for test_fraction=0.4; give more recordings, or import with "
-        "test_fraction=0 for training scenes only"
+    assert line.startswith(
+        "splits: groups: 1 (hand/minute-0000): expected at least two"
     )
     training = dataclasses.replace(CONFIG, test_fraction=0.0)
     import_logs([alone], tmp_path / "data", training)

@@ -8,42 +8,28 @@ import pytest
 
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Lane, Recording, Track
+from rcirl_jax.types import Kind
+from tests.helpers import roads
+from tests.helpers.roads import recording
 
 ROAD = math.radians(25.0)  # direction of travel
 
 
 def car(number, *, speed=15.0, kind=Kind.VEHICLE, backwards=False):
-    t = np.arange(50) * 0.1
-    way = (-1.0 if backwards else 1.0) * speed * t
-    across = 3.5 * number
-    return Track(
-        id=f"{number}",
-        kind=kind,
-        t=t,
-        x=way * math.cos(ROAD) - across * math.sin(ROAD),
-        y=way * math.sin(ROAD) + across * math.cos(ROAD),
-        heading=np.full(50, ROAD),
-        speed=np.full(50, speed),
-        length=4.5,
-        width=1.8,
+    """For 5 s along the road; backwards it still looks ahead."""
+    way = -speed if backwards else speed
+    made = roads.car(
+        f"{number}", lambda t: way * t, y=3.5 * number, seconds=4.9, kind=kind
     )
+    x = made.x * math.cos(ROAD) - made.y * math.sin(ROAD)
+    y = made.x * math.sin(ROAD) + made.y * math.cos(ROAD)
+    return dataclasses.replace(made, x=x, y=y, heading=made.heading + ROAD)
 
 
 def lane(width):
-    return Lane(
-        id="a",
-        centre=np.array([[0.0, 0.0], [100.0, 80.0]]),
-        left_width=np.full(2, width / 2),
-        right_width=np.full(2, width / 2),
-        speed_limit=None,
-    )
-
-
-def recording(*tracks, lanes=()):
-    return Recording(
-        name="log", source="", licence="", rate_hz=10.0, tracks=tracks, lanes=lanes
-    )
+    made = roads.lane("a", np.array([0.0, 100.0]), np.array([0.0, 80.0]), limit=None)
+    half = np.full(2, width / 2)
+    return dataclasses.replace(made, left_width=half, right_width=half)
 
 
 def changed(change, count=4):
@@ -64,7 +50,7 @@ def test_a_true_recording_passes():
 )
 def test_headings_in_another_convention_are_named(angles, words):
     wrong = changed(lambda track: {"heading": angles(track.heading)})
-    with pytest.raises(InputError, match=r"^log: heading: \d+ degrees") as error:
+    with pytest.raises(InputError, match=r"^hand: heading: \d+ degrees") as error:
         validate_recording(recording(*wrong))
     assert words in str(error.value)
 
@@ -90,7 +76,7 @@ def test_who_reverses_stands_or_walks_is_not_judged():
 )
 def test_sizes_are_judged_by_each_other_and_by_the_lanes(change, lane_width, words):
     wrong = changed(lambda track: change)
-    with pytest.raises(InputError, match=r"^log: (length|width): median") as error:
+    with pytest.raises(InputError, match=r"^hand: (length|width): median") as error:
         validate_recording(recording(*wrong, lanes=(lane(lane_width),)))
     assert words in str(error.value)
 
@@ -104,6 +90,6 @@ def test_speeds_in_another_unit_are_named(factor, words):
     slow = [
         dataclasses.replace(one, x=one.x * 8 / 15, y=one.y * 8 / 15) for one in wrong
     ]
-    with pytest.raises(InputError, match=r"^log: speed: ") as error:
+    with pytest.raises(InputError, match=r"^hand: speed: ") as error:
         validate_recording(recording(*slow))
     assert words in str(error.value)

@@ -1,6 +1,7 @@
 """Lanes estimated from tracks lie where the true ones do, linked as they are."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -11,20 +12,22 @@ from rcirl_jax.data.roads import roads_from_tracks
 from rcirl_jax.data.scenes.lanes import LaneGraph, project
 from rcirl_jax.types import Recording
 from tests.data.formats.fixtures.drives import straight
-from tests.helpers.driven_roads import country_road, crossing, highway, motorway
+from tests.helpers.driven_roads import crossing, motorway
 
 DRIVEN = {
-    "two lanes and a slip road": highway(),
     "a motorway": motorway(),
-    "a country road": country_road(),
     "a crossing": crossing(),
 }
 
 
-@pytest.fixture(scope="module", params=DRIVEN)
+@functools.cache
+def roads_of(name):
+    return roads_from_tracks(DRIVEN[name].tracks)
+
+
+@pytest.fixture(params=DRIVEN)
 def case(request):
-    driven = DRIVEN[request.param]
-    return request.param, driven, roads_from_tracks(driven.tracks)
+    return request.param, DRIVEN[request.param], roads_of(request.param)
 
 
 def chain_near(lanes, line):
@@ -75,8 +78,8 @@ def test_there_is_no_lane_that_nobody_drives_on(case):
 def test_widths_and_neighbours(case):
     name, _, roads = case
     by_id = {lane.id: lane for lane in roads.lanes}
-    width = {"two lanes and a slip road": 3.6, "a motorway": 3.5}.get(name)
-    if width is None:
+    width = 3.5
+    if name == "a crossing":
         assert np.isnan(roads.width)
         assert all(lane.left is lane.right is None for lane in roads.lanes)
         return
@@ -93,10 +96,7 @@ def test_widths_and_neighbours(case):
 
 
 def test_a_crossing_leads_to_three_arms():
-    lines, roads = (
-        DRIVEN["a crossing"].lanes,
-        roads_from_tracks(DRIVEN["a crossing"].tracks),
-    )
+    lines, roads = DRIVEN["a crossing"].lanes, roads_of("a crossing")
     reached = roads_reached(roads, roads_lane_at(roads, lines["0 on"][5]))
     for end in ("0 on", "0 left", "0 right"):
         assert roads_lane_at(roads, lines[end][-5]).id in reached, end
@@ -107,22 +107,12 @@ def graph_of(roads):
     return LaneGraph(Recording(**options, tracks=(), lanes=roads.lanes))
 
 
-@pytest.fixture(scope="module")
-def motorway_roads():
-    driven = DRIVEN["a motorway"]
-    return driven, roads_from_tracks(driven.tracks)
-
-
 @pytest.mark.parametrize(
-    ("name", "lane", "at", "side"),
-    [
-        ("a motorway", "slip", -1, "left"),
-        ("a motorway", "2", 0, "right"),
-    ],
+    ("lane", "at", "side"), [("slip", -1, "left"), ("2", 0, "right")]
 )
-def test_a_lane_ends_or_begins_beside_another(name, lane, at, side):
+def test_a_lane_ends_or_begins_beside_another(lane, at, side):
     """It is no fork and no join: who merges changes lanes."""
-    lines, roads = DRIVEN[name].lanes, roads_from_tracks(DRIVEN[name].tracks)
+    lines, roads = DRIVEN["a motorway"].lanes, roads_of("a motorway")
     last = roads_lane_at(roads, lines[lane][at + (5 if at == 0 else -4)])
     if at:
         assert last.successors == ()
@@ -136,9 +126,8 @@ def test_a_lane_ends_or_begins_beside_another(name, lane, at, side):
     assert np.max(turn / np.hypot(*way[1:].T)) < 0.01  # 1/m, no swerve
 
 
-def test_changes_of_lane_are_found_where_they_are(motorway_roads):
-    driven, roads = motorway_roads
-    graph = graph_of(roads)
+def test_changes_of_lane_are_found_where_they_are():
+    driven, graph = DRIVEN["a motorway"], graph_of(roads_of("a motorway"))
     found = {x.id: changes_of_lane(x, graph) for x in driven.tracks}
     true = {x.id: [] for x in driven.tracks}
     for name, place in driven.changes:
@@ -152,9 +141,9 @@ def test_changes_of_lane_are_found_where_they_are(motorway_roads):
     assert hits >= 0.95 * sum(len(places) for places in found.values())
 
 
-def test_who_merges_is_described_along_the_lane_that_ends(motorway_roads):
+def test_who_merges_is_described_along_the_lane_that_ends():
     """The line goes on beside the road, and its room closes."""
-    driven, roads = motorway_roads
+    driven, roads = DRIVEN["a motorway"], roads_of("a motorway")
     graph = graph_of(roads)
     chain = graph.chain(roads_lane_at(roads, driven.lanes["slip"][300]).id, ())
     frame = graph.frame(chain)
@@ -183,9 +172,10 @@ def roads_reached(roads, lane):
 
 
 def test_lane_numbers_of_the_log_name_the_lanes():
-    driven = highway(2, share=0.0, lanes=3, minutes=3.0)
-    tracks = [t for t in driven.tracks if t.id not in driven.changes]
-    lines = [KDTree(driven.lanes[str(n)]) for n in range(3)]
+    driven = motorway(minutes=3.0)
+    changed = {name for name, _ in driven.changes}
+    tracks = [t for t in driven.tracks if t.id not in changed]
+    lines = [KDTree(driven.lanes[name]) for name in ("0", "1", "exit")]
     labels = [
         np.argmin([line.query(np.stack([t.x, t.y], 1))[0] for line in lines], axis=0)
         for t in tracks

@@ -9,7 +9,7 @@ from rcirl_jax.types import Kind, Track
 
 @dataclasses.dataclass
 class Driven:
-    """Tracks, the true middle of each lane [m, 2] m, and who changes lanes."""
+    """Tracks, the middle of each lane [m, 2] m, and (track, place) of changes."""
 
     tracks: list
     lanes: dict
@@ -76,60 +76,6 @@ def drive(rng, name, road, left_of, speed, start, *, rate=12.5, noise=0.15):
     )
 
 
-def highway(seed=0, *, minutes=6.0, lanes=2, width=3.6, share=0.14, noise=0.15):
-    """A curve of 400 m radius, and a slip road whose drivers merge from the right.
-
-    Args:
-      seed: of the traffic.
-      minutes: of traffic.
-      lanes: beside the slip road.
-      width: m of each.
-      share: of drivers who change lanes.
-      noise: m, of positions.
-    """
-    rng, s = np.random.default_rng(seed), np.arange(501.0)
-    kappa = np.where((s > 150.0) & (s < 330.0), 1.0 / 400.0, 0.0)
-    road = curve(s, np.convolve(kappa, np.ones(40) / 40.0, "same"), (50.0, -30.0), 0.6)
-    slip = -width - 35.0 * np.maximum((180.0 - s) / 180.0, 0.0) ** 2
-    found = Driven([], {f"{n}": beside(*road, n * width) for n in range(lanes)})
-    found.lanes["slip"] = beside(*road, slip)[:270]  # many still drive on it there
-
-    def add(speed, start, left_of):
-        name = str(len(found.tracks))
-        options = {"noise": noise}
-        found.tracks.append(drive(rng, name, road, left_of, speed, start, **options))
-
-    for lane in range(lanes):
-        start = rng.uniform(0.0, 5.0)
-        while start < 60.0 * minutes:
-            speed, other = rng.uniform(20.0, 28.0), lane
-            if rng.random() < share and lanes > 1:
-                other = lane + (1 if lane == 0 else -1)
-                found.changes.append(str(len(found.tracks)))
-            begin, length = rng.uniform(60.0, 300.0), speed * rng.uniform(4.0, 7.0)
-            add(
-                speed,
-                start,
-                lambda s, a=lane, b=other, at=begin, n=length: (
-                    width * (a + (b - a) * ramp(s, at, n))
-                ),
-            )
-            start += rng.exponential(5.0) + 1.5
-    start = rng.uniform(0.0, 8.0)
-    while start < 60.0 * minutes:
-        speed, begin = rng.uniform(16.0, 22.0), rng.uniform(190.0, 290.0)
-        found.changes.append(str(len(found.tracks)))
-        add(
-            speed,
-            start,
-            lambda x, at=begin, n=4.0 * speed: (
-                np.interp(x, s, slip) + width * ramp(x, at, n)
-            ),
-        )
-        start += rng.exponential(15.0) + 2.0
-    return found
-
-
 def motorway(seed=0, *, minutes=6.0, width=3.5):
     """Two lanes that bend to the right, between a slip road, an exit and a third lane.
 
@@ -179,23 +125,6 @@ def motorway(seed=0, *, minutes=6.0, width=3.5):
                 other = {"0": "1", "1": "0"}[lane]
             add(speed, start, lane, other, begin)
             start += rng.exponential(every) + 1.5
-    return found
-
-
-def country_road(seed=0, *, minutes=5.0, radius=60.0, width=3.4):
-    """A lane each way through a tight S."""
-    rng, s = np.random.default_rng(seed), np.arange(401.0)
-    kappa = np.where((s > 80.0) & (s < 180.0), 1.0, 0.0)
-    kappa -= np.where((s > 220.0) & (s < 320.0), 1.0, 0.0)
-    points, heading = curve(s, np.convolve(kappa / radius, np.ones(20) / 20.0, "same"))
-    roads = {"ahead": (points, heading), "back": (points[::-1], heading[::-1] + np.pi)}
-    found = Driven([], {n: beside(*road, -0.5 * width) for n, road in roads.items()})
-    for road in roads.values():
-        start = 0.0
-        while start < 60.0 * minutes:
-            made = (rng, str(len(found.tracks)), road, lambda x: 0.0 * x - 0.5 * width)
-            found.tracks.append(drive(*made, rng.uniform(11.0, 17.0), start))
-            start += rng.exponential(8.0) + 2.0
     return found
 
 

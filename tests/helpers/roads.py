@@ -1,5 +1,7 @@
 """Recordings made by hand: cars on a straight road of three lanes."""
 
+import dataclasses
+
 import numpy as np
 
 from rcirl_jax.data.scenes.collect import Collector
@@ -61,10 +63,22 @@ def car(name, s, y=0.0, seconds=12.0, kind=Kind.VEHICLE, **more):
     )
 
 
+def part(track, begin=-np.inf, end=np.inf, name=None):
+    """The samples of a track within a time [s], as a track of its own."""
+    inside = (track.t >= begin - 1e-6) & (track.t <= end + 1e-6)
+    series = {one: getattr(track, one)[inside] for one in SERIES}
+    return dataclasses.replace(track, id=name or track.id, **series)
+
+
 def recording(*tracks, lanes=None, **more):
     """Cars on a road, at 10 Hz."""
     about = {"name": "hand", "source": "test", "licence": "none", "rate_hz": 10.0}
     return Recording(**about, tracks=tracks, lanes=lanes or road(), **more)
+
+
+def steady(start, v=12.0):
+    """Stations at one speed [m/s] from a place [m]."""
+    return lambda t: start + v * t
 
 
 def speeding_up(start, v=12.0, a=0.3):

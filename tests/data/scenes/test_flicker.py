@@ -9,16 +9,9 @@ from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.scenes.tracks import JOINED, SHORT, joined, steady_tracks
 from rcirl_jax.types import Kind
-from tests.helpers.roads import NO_FILTER, SERIES, WIDTH, car, recording, speeding_up
+from tests.helpers.roads import NO_FILTER, WIDTH, car, part, recording, speeding_up
 
 EGO = car("ego", speeding_up(20.0))
-
-
-def between(track, begin, end, name=None):
-    """The part of a track within a time, as a track of its own."""
-    inside = (track.t >= begin - 1e-6) & (track.t <= end + 1e-6)
-    series = {one: getattr(track, one)[inside] for one in SERIES}
-    return dataclasses.replace(track, id=name or track.id, **series)
 
 
 def standing(name="parked", x=80.0, seconds=12.0, **more):
@@ -40,7 +33,7 @@ def starting(t):
     ],
 )
 def test_a_minimum_life(begin, end, kept):
-    made = recording(EGO, between(car("other", speeding_up(60.0)), begin, end))
+    made = recording(EGO, part(car("other", speeding_up(60.0)), begin, end))
     found, counts = steady_tracks(made, CollectConfig())
     assert [track.id for track in found.tracks] == ["ego", "other"][: 1 + kept]
     assert counts == ({} if kept else {SHORT: 1})
@@ -51,9 +44,9 @@ def test_a_minimum_life(begin, end, kept):
 def test_fragments_of_a_standing_body_are_one():
     whole = standing(kind=Kind.STATIC)
     parts = [
-        between(whole, 0.0, 2.0, "7"),
-        between(whole, 2.4, 2.6, "8"),  # too short to live alone
-        between(whole, 6.0, 12.0, "9"),
+        part(whole, 0.0, 2.0, "7"),
+        part(whole, 2.4, 2.6, "8"),  # too short to live alone
+        part(whole, 6.0, 12.0, "9"),
     ]
     made = recording(EGO, *parts)
     found, counts = steady_tracks(made, CollectConfig())
@@ -72,11 +65,11 @@ def test_fragments_of_a_standing_body_are_one():
 def test_one_body_under_two_names():
     """Both at a time; and a waiting car that drives off under the other."""
     whole = standing()
-    one, two = between(whole, 0.0, 6.0, "1"), between(whole, 4.0, 12.0, "2")
+    one, two = part(whole, 0.0, 6.0, "1"), part(whole, 4.0, 12.0, "2")
     (made,) = joined([one, two], 5.0)
     np.testing.assert_allclose(made.t, whole.t)
     whole = car("a", starting)
-    (made,) = joined([between(whole, 0.0, 5.0, "1"), between(whole, 6.0, 12.0)], 5.0)
+    (made,) = joined([part(whole, 0.0, 5.0, "1"), part(whole, 6.0, 12.0)], 5.0)
     assert made.id == "1"
     assert made.x[-1] == pytest.approx(88.0)
 
@@ -84,14 +77,14 @@ def test_one_body_under_two_names():
 @pytest.mark.parametrize(
     "second",
     [
-        between(standing("2", x=81.2), 5.0, 12.0),  # another place
-        between(standing("2"), 8.5, 12.0),  # 5.5 s later
-        between(car("2", lambda t: 56.0 + 4.8 * t, y=-WIDTH), 5.0, 12.0),  # drives past
+        part(standing("2", x=81.2), 5.0, 12.0),  # another place
+        part(standing("2"), 8.5, 12.0),  # 5.5 s later
+        part(car("2", lambda t: 56.0 + 4.8 * t, y=-WIDTH), 5.0, 12.0),  # drives past
     ],
     ids=["elsewhere", "later", "moving"],
 )
 def test_others_are_not_joined(second):
-    first = between(standing("1"), 0.0, 3.0)
+    first = part(standing("1"), 0.0, 3.0)
     assert [track.id for track in joined([first, second], 5.0)] == ["1", "2"]
     leader = [car("1", speeding_up(20.0), seconds=5.0), car("2", speeding_up(60.0))]
     assert joined(leader, 5.0) == leader

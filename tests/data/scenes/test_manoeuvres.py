@@ -14,13 +14,10 @@ from tests.helpers.roads import (
     recording,
     smooth_step,
     speeding_up,
+    steady,
 )
 
 D = Decision
-
-
-def steady(start, v=12.0):
-    return lambda t: start + v * t
 
 
 def entering(t):

@@ -8,9 +8,10 @@ import pytest
 from rcirl_jax.data.scenes.motion import GRID_M
 from rcirl_jax.geometry.relevance import relevance_distance
 from rcirl_jax.planner.prediction import NUM_BODIES, Bodies, most_relevant
-from rcirl_jax.types import Ego, Kind, Path
-from rcirl_jax.units import NUM_OBSTACLES, NUM_STATIONS, TIMES_S
+from rcirl_jax.types import Kind
+from rcirl_jax.units import NUM_OBSTACLES, TIMES_S
 from tests.helpers.roads import WIDTH, car, first_scene, recording
+from tests.helpers.scenes import scene
 
 HALF = 1.8  # m, both half widths
 STRAIGHT = np.zeros(GRID_M.size)
@@ -72,14 +73,7 @@ def test_both_doors_choose_the_same_of_a_crowd():
         l_dot=0 * one, a=0 * one, half_s=2.25 * one, half_l=0.9 * one,
         kind=jnp.full(len(crowd), Kind.VEHICLE), present=one > 0,
     )  # fmt: skip
-    zero, flat = jnp.zeros(()), jnp.zeros(NUM_STATIONS)
-    human = Ego(
-        s=zero, l=zero, dl=zero, ddl=zero, v=jnp.asarray(v[0]), a=zero,
-        length=jnp.asarray(4.5), width=jnp.asarray(1.8),
-    )  # fmt: skip
-    path = Path(
-        kappa=flat, l=flat, speed_limit=flat + 25.0, lane_left=flat + 1.8,
-        lane_right=flat - 1.8, road_left=flat + 5.4, road_right=flat - 5.4,
-    )  # fmt: skip
-    chosen = jax.jit(most_relevant)(bodies, human, path) + 1
+    made = scene(v=v[0])
+    human = made.ego.replace(length=jnp.asarray(4.5), width=jnp.asarray(1.8))
+    chosen = jax.jit(most_relevant)(bodies, human, made.path) + 1
     assert row["obstacles.track"][:NUM_BODIES].tolist() == chosen.tolist()

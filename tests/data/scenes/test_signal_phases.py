@@ -1,5 +1,7 @@
 """Written signals against drivers."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -18,48 +20,16 @@ from rcirl_jax.data.scenes.signal_phases import (
     period,
 )
 from rcirl_jax.runtime.executors import Processes, Serial
-from rcirl_jax.types import Kind, Lane, Recording, Signal, Track
-
-T = np.arange(0.0, 11.05, 0.1)  # s
-LENGTH_M, WIDTH_M, LANE_M = 4.6, 1.8, 3.6
+from rcirl_jax.types import Signal
+from tests.helpers.roads import car, recording, road
 
 
 def light(offset, until=200.0):
     """30 s green, 3 s yellow, 27 s red, from `offset` on."""
-    starts, states, t = [], [], offset - 120.0
-    while t < until:
-        for state, seconds in (("green", 30.0), ("yellow", 3.0), ("red", 27.0)):
-            starts.append(t)
-            states.append(state)
-            t += seconds
-    return Signal(
-        id="light", start=np.array(starts), state=tuple(states), is_recorded=False
-    )
-
-
-def car(name, x):
-    still = np.zeros(T.size)
-    return Track(
-        id=name, kind=Kind.VEHICLE, length=LENGTH_M, width=WIDTH_M, t=T, x=x,
-        y=still, heading=still, speed=np.gradient(x, T),
-    )  # fmt: skip
-
-
-def lanes(line):
-    """Three along x whose line at x = `line` m the light governs."""
-    x = np.arange(0.0, 560.0, 4.0)
-    half = np.full(x.size, LANE_M / 2)
-    names = ("left", "mid", "right")
-    return tuple(
-        Lane(
-            id=name, centre=np.stack([x, np.full(x.size, (1 - i) * LANE_M)], 1),
-            left_width=half, right_width=half, speed_limit=25.0,
-            left=names[i - 1] if i else None, right=names[i + 1] if i < 2 else None,
-            stop_line=np.array([[line, (j - i) * LANE_M] for j in (1.5, 0.5)]),
-            signal_ids=("light",),
-        )
-        for i, name in enumerate(names)
-    )  # fmt: skip
+    cycles = np.arange(offset - 120.0, until, 60.0)
+    starts = (cycles[:, None] + [0.0, 30.0, 33.0]).ravel()
+    states = ("green", "yellow", "red") * cycles.size
+    return Signal(id="light", start=starts, state=states, is_recorded=False)
 
 
 def drives_of(number, written):
@@ -70,14 +40,18 @@ def drives_of(number, written):
     """
     rng = np.random.default_rng(number)
     green = number % 2 == 0
-    x = 130.0 + (rng.uniform(8.0, 12.0) if green else 0.0) * (T - 2.0)
-    line = 130.0 + (30.0 if green else 0.5 * LENGTH_M + 2.0)
-    since = -5.0 if green else -38.0
-    return Recording(
-        name=f"AAA_Place-1_{number}_T-1", source="test", licence="none", rate_hz=10.0,
-        tracks=(car("ego", x), car("behind", x - rng.uniform(12.0, 20.0))),
-        lanes=lanes(line), signals=(light(since + written),),
-    )  # fmt: skip
+    speed = rng.uniform(8.0, 12.0) if green else 0.0
+    behind = rng.uniform(12.0, 20.0)
+    tracks = [
+        car(name, lambda t, at=at: at + speed * (t - 2.0), seconds=11.0)
+        for name, at in (("ego", 130.0), ("behind", 130.0 - behind))
+    ]
+    made = recording(
+        *tracks,
+        lanes=road(160.0 if green else 134.25, ("light",), length=560.0),
+        signals=(light((-5.0 if green else -38.0) + written),),
+    )
+    return dataclasses.replace(made, name=f"AAA_Place-1_{number}_T-1")
 
 
 def checked(made):

@@ -146,7 +146,6 @@ def test_shards_that_are_none(small, change, words):
 GROUPS, FLOAT32 = "splits: .*expected every group", ".*float64.*expected .*float32"
 BAD_MANIFESTS = [
     (lambda m: m.update(schema_version=1), "schema_version: 1: expected 2"),
-    (lambda m: m.pop("quality"), "quality: missing: expected"),
     (lambda m: m["arrays"]["human.s"].update(dtype="float64"), FLOAT32),
     (lambda m: m["time_grid_s"].pop(), "time_grid_s"),
     (lambda m: (m["shards"][0].update(count=3), m.update(count=3)), "shard 0: float32"),

@@ -96,15 +96,6 @@ def copy(made, tmp_path):
     return shutil.copytree(made, tmp_path / "copy")
 
 
-def test_facts_stand_beside_the_manifest(copy):
-    dataset = open_dataset(copy)
-    assert dataset.facts() == {}
-    dataset.write_facts({"made_by": {"git_commit": "abc"}, "share": np.float32(0.5)})
-    again = open_dataset(copy)
-    assert again.facts() == {"made_by": {"git_commit": "abc"}, "share": 0.5}
-    assert again.hash == dataset.hash
-
-
 def test_rows_splits_and_manifest_are_those_written(made):
     """To the bit; digests are those of the bytes, and the splits follow the groups."""
     dataset, whole = open_dataset(made), joined()
@@ -143,12 +134,10 @@ def test_urls(scheme, tmp_path):
     assert "finished dataset" in refused(DatasetWriter, url)
 
 
-@given(
-    asked=st.lists(st.integers(0, sum(SIZES) - 1), max_size=60), verify=st.booleans()
-)
-def test_read_gives_rows_in_the_order_asked(made, asked, verify):
+@given(asked=st.lists(st.integers(0, sum(SIZES) - 1), max_size=60))
+def test_read_gives_rows_in_the_order_asked(made, asked):
     rows = np.array(asked, np.int64)
-    dataset = open_dataset(made, verify=verify)
+    dataset = open_dataset(made, verify=False)
     assert_same(dataset.read(rows), jax.tree.map(lambda leaf: leaf[rows], joined()))
     for bad in ([-1], [sum(SIZES)], [[0]]):
         with pytest.raises(IndexError, match="expected a list of numbers below"):
@@ -191,9 +180,7 @@ def interrupt_after(monkeypatch, writes):
 FILES = 2 * len(jax.tree.leaves(row_spec())) + 1
 
 
-@pytest.mark.parametrize(
-    "writes", [0, 1, FILES - 1, FILES, FILES + 9, 3 * FILES - 1, 3 * FILES]
-)
+@pytest.mark.parametrize("writes", [1, FILES - 1, FILES, FILES + 9, 3 * FILES])
 def test_interrupted_import_resumes_to_the_same_bytes(
     made, tmp_path, monkeypatch, writes
 ):
@@ -222,8 +209,10 @@ def test_resuming_stops_at_the_first_damaged_shard(made, copy):
     assert every_byte(copy) == every_byte(made)
 
 
-@pytest.mark.parametrize("existed", [False, True])
-@pytest.mark.parametrize("writes", [1, 5, 30, FILES + 1, 2 * FILES])
+@pytest.mark.parametrize(
+    ("writes", "existed"),
+    [(1, False), (30, True), (FILES + 1, False), (2 * FILES, True)],
+)
 def test_abort_leaves_nothing(tmp_path, monkeypatch, existed, writes):
     """Also where it comes in the middle of a shard."""
     folder = tmp_path / "deep" / "dataset"
@@ -255,8 +244,10 @@ def test_overwriting(made, copy):
     assert sorted(path.name for path in (copy / "shards").iterdir()) == ["00000"]
 
 
-@pytest.mark.parametrize("overwrite", [False, True])
-@pytest.mark.parametrize("name", ["thesis.tex", "shards/readme", "a/b/c"])
+@pytest.mark.parametrize(
+    ("name", "overwrite"),
+    [("thesis.tex", True), ("shards/readme", True), ("a/b/c", False)],
+)
 def test_folders_with_other_files_are_refused(tmp_path, overwrite, name):
     path = tmp_path / name
     path.parent.mkdir(parents=True, exist_ok=True)
