@@ -1,4 +1,4 @@
-"""Runs side by side: what differs, their numbers, folders that are no run."""
+"""Runs side by side: what differs, their numbers, files that were changed."""
 
 import json
 import re
@@ -11,7 +11,7 @@ from rcirl_jax.evaluation.gate.verdict import write_verdict
 from rcirl_jax.evaluation.statistics import clopper_pearson
 from rcirl_jax.report.compare import read_run
 from rcirl_jax.runtime.pipeline import file_sha256
-from tests.helpers.commands import refused, succeeded
+from tests.helpers.commands import succeeded
 from tests.report.test_data_page import Page
 from tests.report.tuning_case import suite_and_verdict
 
@@ -111,16 +111,3 @@ def test_a_file_that_was_edited_or_removed_is_refused(name, tmp_path):
     path.unlink()
     with pytest.raises(InputError, match=r"no verdict|changed since"):
         read_run(run)
-
-
-@pytest.mark.multiprocess
-def test_what_is_no_run_is_one_line(tmp_path):
-    run, _ = write_run(tmp_path / "run")
-    (tmp_path / "none").mkdir()
-    for words, message in (
-        ((str(run), str(tmp_path / "none")), f"{tmp_path}/none: no verdict in it"),
-        ((str(run),), "--runs: 1 given: expected two folders"),
-    ):
-        page = tmp_path / "compare.html"
-        assert message in refused("rcirl_jax", "compare", *words, f"--output={page}")
-        assert not page.exists()
