@@ -2,8 +2,6 @@
 
 import doctest
 import inspect
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -11,6 +9,7 @@ import pytest
 import rcirl_jax
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
+from tests.helpers.commands import python
 
 MOST = 25  # names that a newcomer has to look through
 SLOW = {"tune"}  # its stages are those of `rcirl autotune`, which has its tests
@@ -47,15 +46,12 @@ def test_a_name_that_is_none_of_it():
     ids=["weights", "all"],
 )
 def test_what_a_name_does_not_load(names, absent):
-    text = (
+    done = python(
         "import sys, rcirl_jax\n"
         f"[getattr(rcirl_jax, name) for name in {names}]\n"
         f"print({absent!r} in sys.modules)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", text], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == "False"
+    assert done.stdout.strip() == "False", done.stderr
 
 
 SHOWN = {name: getattr(rcirl_jax, name) for name in rcirl_jax.__all__}

@@ -1,12 +1,11 @@
 """The whole loop by one call."""
 
 import json
-import subprocess
-import sys
 
 import pytest
 
-from tests.docs.pages import REPO
+from tests.conftest import REPO
+from tests.helpers.commands import python
 
 TWICE = """
 import sys
@@ -25,10 +24,7 @@ print("decision:", verdict.decision)
 def test_it_ends_with_the_verdict_of_the_folder(examples, tmp_path):
     """And keeps all stages when it is called again."""
     run = tmp_path / "run"
-    done = subprocess.run(
-        [sys.executable, "-c", TWICE, examples / "data", run],
-        capture_output=True, text=True, check=False, cwd=REPO,
-    )  # fmt: skip
+    done = python(TWICE, examples / "data", run, cwd=REPO)
     assert done.returncode == 0, done.stderr[-2000:]
     verdict = json.loads((run / "verdict.json").read_text())
     assert verdict["cases"] == 30

@@ -15,25 +15,20 @@ CITED = re.findall(r"`(\w+)\.json`", (DOCS / "results.md").read_text())
 MADE = [file for command in remake.COMMANDS for file in command.files]
 
 
+def git(*words):
+    return subprocess.run(
+        ["git", "-C", str(REPO), *words], capture_output=True, text=True, check=False
+    )
+
+
 @pytest.mark.parametrize("name", CITED)
 def test_a_cited_file_can_be_made_again_and_says_what_made_it(name):
     assert name in MADE
     body = json.loads((remake.RESULTS / f"{name}.json").read_text())
     commit = body["made_by"]["git_commit"].rstrip("+")
-    git = ["git", "-C", str(REPO)]
-    if (
-        subprocess.run(
-            [*git, "rev-parse", "--is-shallow-repository"],
-            capture_output=True,
-            check=False,
-            text=True,
-        ).stdout.strip()
-        != "false"
-    ):
-        pytest.skip("the history is not here")  # fmt: skip
-    found = subprocess.run(
-        [*git, "merge-base", "--is-ancestor", commit, "HEAD"], check=False
-    )
+    if git("rev-parse", "--is-shallow-repository").stdout.strip() != "false":
+        pytest.skip("the history is not here")
+    found = git("merge-base", "--is-ancestor", commit, "HEAD")
     assert found.returncode == 0, f"{name}: {commit}: not in the history"
 
 
