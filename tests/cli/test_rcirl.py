@@ -126,22 +126,6 @@ def test_a_flag_that_is_missing_is_named_with_an_example(name, every):
 
 
 @pytest.mark.multiprocess
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("import --output={out}", "--input: not given: expected a file or folder"),
-        ("tune", "tune: unknown: expected one of autotune, "),
-        ("import --stride=far", "--stride: far: expected a number"),
-        ("sweep --trails=9", "Did you mean: trials"),
-        ("rank --flagfile=nix", "error: --flagfile: nix: No such file or directory: "),
-    ],
-)
-def test_a_wrong_command_is_one_line(words, message, tmp_path):
-    given = words.format(out=tmp_path / "out").split()
-    assert message in refused("rcirl_jax", *given)
-
-
-@pytest.mark.multiprocess
 def test_no_flag_of_absl_ends_a_gate_before_its_verdict(tmp_path):
     """Also from a file: status 0 of a gate means "ship" and nothing else."""
     (tmp_path / "flags").write_text("--helpxml\n")

@@ -2,7 +2,6 @@
 
 import html
 import json
-import re
 
 import pytest
 
@@ -44,17 +43,11 @@ def test_a_small_loop(tmp_path):
     begun = [x for x in done.stdout.splitlines() if x.startswith("stage ")]
     names = ("import", "demonstrate", "train", "rank", "simulate", "gate", "report")
     for number, (line, name) in enumerate(zip(begun, names, strict=True), 1):
-        assert re.match(rf"stage {number} of 7: {name}; [\d hmins]+ so far", line), line
-        assert number == 1 or line.endswith(" left, compiling not counted")
-    *_, last = done.stdout.split("\n\n")
-    assert "\nwarning: training: " in done.stdout
-    ending = last.splitlines()
-    assert len(ending) <= 10
+        assert line.startswith(f"stage {number} of 7: {name}; ")
+    ending = done.stdout.split("\n\n")[-1].splitlines()
     assert ending[0].startswith("verdict: ")
     assert f"report to open: {run}/report.html" in ending
     assert ending[-1].startswith(f"next: rcirl replay --weights={run}/weights.msgpack ")
-    for bar in ("rank the scenes", "drive the cases: candidate", "draw the report"):
-        assert bar in done.stderr
     stages = [
         "import 0", "demonstrate", "prior cost", "train 0", "export", "tune",
         "rank predicted", "rank recorded", "simulate", "likeness", "gate", "dial",
@@ -68,8 +61,7 @@ def test_a_small_loop(tmp_path):
     assert verdict["decision"] in page
     assert f'"recipe": "{own}"' in html.unescape(page)
     assert verdict["training_runs"] == 1
-    left_out = "30 cases, 4,110 of the full suite's left out; cases of 2 s instead of"
-    assert verdict["part"].startswith(left_out)
+    assert verdict["part"].startswith("30 cases, 4,110 of the full suite's left out")
     assert "recorded human" in page  # drives beside the others
     assert "features without effect" in done.stdout
     likeness = json.loads((run / "likeness.json").read_text())
@@ -111,12 +103,6 @@ def test_a_small_loop(tmp_path):
     dataset = open_dataset(*run.glob("dataset-*"))
     assert dataset.facts()["data_hash"] == dataset.hash
     assert "flags" in dataset.facts()["made_by"]
-
-
-@pytest.mark.multiprocess
-def test_a_page_of_no_run_is_one_line(tmp_path):
-    line = refused("rcirl_jax", "report", f"--run={tmp_path}")
-    assert line.endswith("stages.json: gate: missing: expected a run with its verdict")
 
 
 @pytest.mark.multiprocess

@@ -2,10 +2,7 @@
 
 import pytest
 
-from rcirl_jax.data.importing import import_logs
-from tests.data.small_logs import CONFIG, write_logs
 from tests.helpers.commands import refused
-from tests.helpers.weights_files import random_weights
 
 TRAIN = "train --data={data} --output={out}"
 TUNE = "autotune --output={out}"
@@ -16,14 +13,22 @@ EXPORT = "export --weights={weights}"
 RANK = "human-likeness --data={data} --output={out}"
 SWEEP = "sweep --data={data} --output={out}"
 WRONG = (
+    ("tune", "tune: unknown: expected one of autotune, "),
+    ("import --output={out}", "--input: not given: expected a file or folder"),
+    ("import --stride=far", "--stride: far: expected a number"),
+    ("sweep --trails=9", "Did you mean: trials"),
+    ("rank --flagfile=nix", "error: --flagfile: nix: No such file or directory: "),
     ("import --format=commonroad --input=nowhere --output={out}", "nowhere"),
     ("import --format=synthetic --stride=0 --output={out}", "stride"),
     (f"{TRAIN} more", "more"),
     (f"{TRAIN} --num_processes=2", "all three"),
     (f"{TRAIN} --tags=turnig", "--tags: turnig: expected some of"),
     (f"{TRAIN} --hidden_size=4 --constraint=nonnegative", "--hidden_size: (4,): exp"),
-    ("rank --weights=nowhere --data=nowhere", "nowhere"),
     ("export --run=nowhere", "run.json: missing"),
+    ("inspect --data={data} --output={out} --rows=1,two", "expected row numbers"),
+    ("compare {data} {data} --output={out}", "data: no verdict in it: expected"),
+    ("compare {data} --output={out}", "--runs: 1 given: expected two folders"),
+    ("report --run={data}", "gate: missing: expected a run with its verdict"),
     ("export --onnx={out}", "--run, --weights: expected one of them"),
     (f"{EXPORT} --yaml={{out}}", "expected a linear reward"),
     (f"{ELSEWHERE} --simulator=sumoo", "did you mean sumo?"),
@@ -48,20 +53,12 @@ WRONG = (
 )
 
 
-@pytest.fixture(scope="session")
-def places(tmp_path_factory):
-    """A dataset and a weights file."""
-    folder = tmp_path_factory.mktemp("wrong")
-    import_logs(write_logs(folder / "logs", 3), folder / "data", CONFIG)
-    weights = random_weights(folder / "w.msgpack")
-    return {"data": folder / "data", "weights": weights}
-
-
 @pytest.mark.multiprocess
 @pytest.mark.parametrize(("command", "message"), WRONG)
-def test_wrong_flags_are_one_line_before_any_work(command, message, places, tmp_path):
-    out = tmp_path / "out"
-    name, *flags = (word.format(out=out, **places) for word in command.split())
+def test_wrong_flags_are_one_line_before_any_work(command, message, root, tmp_path):
+    places = {"data": root / "data", "weights": root / "w.msgpack"}
+    places["out"] = tmp_path / "out"
+    name, *flags = (word.format(**places) for word in command.split())
     paper = name.startswith("paper.")
     module = (f"experiments.{name}",) if paper else ("rcirl_jax", name)
     assert message in refused(*module, *flags)
@@ -69,8 +66,8 @@ def test_wrong_flags_are_one_line_before_any_work(command, message, places, tmp_
 
 
 @pytest.mark.multiprocess
-def test_a_gate_that_is_refused_leaves_no_verdict_of_another(places, tmp_path):
+def test_a_gate_that_is_refused_leaves_no_verdict_of_another(root, tmp_path):
     (tmp_path / "v.json").write_text("the verdict of another candidate")
-    flags = (f"--candidate={places['weights']}", f"--output={tmp_path}/v.json")
+    flags = (f"--candidate={root}/w.msgpack", f"--output={tmp_path}/v.json")
     refused("rcirl_jax", "gate", *flags, "--incumbent=nobody")
     assert not (tmp_path / "v.json").exists()
