@@ -5,14 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rcirl_jax.features.columns import path_curvature
 from rcirl_jax.geometry.frenet import (
     _curve,
     _from_nearest,
-    lookup,
     project_points,
     reference_line_from_polyline,
 )
@@ -52,11 +49,9 @@ def alone(line, points):
     return jax.vmap(_from_nearest, in_axes=(None, 0, 0, 0))(line, x, y, near)
 
 
-@pytest.mark.parametrize(
-    ("kind", "noise"), [("straight", 0.0), ("clothoid", 0.03), ("s_curve", 0.03)]
-)
-def test_round_trip_within_a_centimetre(kind, noise):
-    line = line_of(curve(kind, noise))
+@pytest.mark.parametrize("kind", ["clothoid", "s_curve"])
+def test_round_trip_within_a_centimetre(kind):
+    line = line_of(curve(kind, 0.03))
     rng = np.random.default_rng(1)
     s = jnp.asarray(rng.uniform(2.0, 190.0, 300), jnp.float32)
     l = jnp.asarray(rng.uniform(-8.0, 8.0, 300), jnp.float32)
@@ -83,9 +78,8 @@ def test_many_points_are_projected_as_one_by_one_also_between_legs(legs_apart):
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("kind", ["straight", "s_curve"])
-def test_shapely_projects_to_the_same_station(kind):
-    points = curve(kind)
+def test_shapely_projects_to_the_same_station():
+    points = curve("s_curve")
     line = line_of(points)
     dense = shapely.LineString(
         np.stack([np.asarray(line.x), np.asarray(line.y)], 1)[: int(line.num_valid)]
@@ -114,13 +108,6 @@ def test_duplicate_points_and_short_lines():
     assert s[0] == pytest.approx(4.0, abs=1e-2)
     assert l[0] == pytest.approx(1.0, abs=1e-2)
     assert project_points(line_of(points), np.zeros((0, 2)))[0].shape == (0,)
-
-
-@given(s=st.floats(-10, 300), seed=st.integers(0, 100))
-def test_lookup_is_numpy_interp(s, seed):
-    table = np.random.default_rng(seed).normal(size=64).astype(np.float32)
-    found = float(lookup(jnp.asarray(table), jnp.float32(s), 2.0))
-    assert found == pytest.approx(np.interp(s, np.arange(64) * 2.0, table), abs=1e-3)
 
 
 def test_curvature_of_a_path_against_finite_differences():

@@ -37,25 +37,20 @@ def family(candidates, name):
 
 @pytest.mark.parametrize("mode", CONFIGS)
 @given(seed=st.integers(0, 10_000))
-def test_any_scene_gives_k_finite_candidates(mode, seed):
+def test_any_scene_gives_k_finite_candidates_from_the_ego_state(mode, seed):
     made = random_scene(seed)
     candidates = SAMPLE[mode](jax.random.key(seed), made)
     count = num_candidates(CONFIGS[mode])
     assert candidates.trajectory.s.shape == (count, TIMES_S.size)
     for leaf in jax.tree.leaves(candidates.trajectory):
         assert np.isfinite(np.asarray(leaf)).all()
+    start = jax.tree.map(lambda x: np.asarray(x)[:, 0], candidates.trajectory)
+    np.testing.assert_allclose(start.s, 0.0, atol=1e-5)
+    np.testing.assert_allclose(start.v, made.ego.v)
+    np.testing.assert_allclose(start.a, made.ego.a)
     stations = np.asarray(candidates.trajectory.s)
     assert (np.diff(stations, axis=1) >= 0.0).all()
     assert np.asarray(candidates.feasible)[family(candidates, "emergency")][:3].all()
-
-
-@pytest.mark.parametrize("mode", CONFIGS)
-def test_all_start_in_the_ego_state(mode):
-    made = random_scene(4)
-    trajectory = SAMPLE[mode](jax.random.key(0), made).trajectory
-    np.testing.assert_allclose(trajectory.s[:, 0], 0.0, atol=1e-5)
-    np.testing.assert_allclose(trajectory.v[:, 0], made.ego.v)
-    np.testing.assert_allclose(trajectory.a[:, 0], made.ego.a)
 
 
 @pytest.mark.parametrize("mode", CONFIGS)
@@ -158,18 +153,7 @@ def test_only_the_random_family_depends_on_the_key():
     assert differs.sum() > 40
 
 
-def test_hard_negatives_depart_from_the_human_with_time():
-    made = scene(v=12.0)
-    human = trajectory_on_path(made, 12.0 * jnp.asarray(TIMES_S))
-    near = NEGATIVES(jax.random.key(0), made, human, CONFIGS["speed"], 16)
-    apart = np.abs(np.asarray(near.trajectory.s - human.s))
-    assert (apart[:, 0] == 0.0).all()
-    assert ((apart[:, -1] >= 0.99) & (apart[:, -1] <= 6.01)).all()
-    signs = np.sign(np.asarray(near.trajectory.s - human.s)[:, -1])
-    assert (signs > 0).sum() == 8
-
-
-def test_some_hard_negatives_drift_aside_where_paths_may_be_chosen():
+def test_hard_negatives_depart_from_the_human_with_time_along_or_aside():
     made = scene(v=12.0)
     human = trajectory_on_path(made, 12.0 * jnp.asarray(TIMES_S))
     near = NEGATIVES(jax.random.key(0), made, human, CONFIGS["path_speed"], 12)
@@ -179,9 +163,13 @@ def test_some_hard_negatives_drift_aside_where_paths_may_be_chosen():
     assert (aside[~drifts] == 0.0).all()
     assert (along[drifts] == 0.0).all()
     assert (aside[:, 0] == 0.0).all()
+    assert (along[:, 0] == 0.0).all()
     last = np.abs(aside[drifts, -1])
     assert ((last >= 0.24) & (last <= 1.51)).all()
     assert sorted(np.sign(aside[drifts, -1])) == [-1, -1, 1, 1]
+    last = along[~drifts, -1]
+    assert ((np.abs(last) >= 0.99) & (np.abs(last) <= 6.01)).all()
+    assert (last > 0).sum() == 4
 
 
 def stepped_scene(first=15.0, second=8.0, station=60.0, **changes):
