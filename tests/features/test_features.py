@@ -129,21 +129,3 @@ def test_classes_by_hand():
     assert at("stop_distance", s=12.45, kind=Kind.STOP, **line) == pytest.approx(10.0)
     virtual = at("virtual_distance", s=12.45, kind=Kind.VIRTUAL, **line)
     assert virtual == pytest.approx(10.0)
-
-
-def test_running_a_red_light_counts_once_and_only_on_red():
-    features = feature_map("paper21")
-    column = features.names.index("collision_distance")
-    red = np.zeros(TIMES_S.size, bool)
-    red[:9] = True
-
-    def closest(v, valid):
-        line = {"kind": Kind.STOP, "length": 0.0, "width": 40.0}
-        made = scene(v=v, boxes=[{"s": 30.0, "valid": valid, **line}])
-        s = v * jnp.asarray(TIMES_S)
-        drive = FROM_POSITIONS(made, s, jnp.zeros_like(s))
-        return np.asarray(JITTED["paper21"](made, drive))[:, column]
-
-    assert (closest(10.0, red) < 0.0).sum() == 1
-    assert (closest(10.0, ~red) < 0.0).sum() == 0
-    assert (closest(1.0, red) < 0.0).sum() == 0
