@@ -13,7 +13,6 @@ from rcirl_jax.reward import (
     Normaliser,
     RewardConfig,
     RewardModel,
-    effective_model,
     effective_params,
     init_params,
     value,
@@ -24,14 +23,6 @@ from rcirl_jax.units import TIMES_S
 FEATURES = feature_map("paper21")
 F, T, K = 21, TIMES_S.size, 5
 GATED = RewardConfig(scene_gating=FEATURES.context)
-CONFIGS = {
-    "linear": {"hidden": ()},
-    "paper": {},
-    "deep, leaky": {"hidden": (8, 4), "activation": "leaky_relu"},
-    "relu, free": {"activation": "relu", "scale_constraint": "none"},
-    "nonnegative": {"hidden": (), "constraint": "nonnegative"},
-    "monotone": {"constraint": "monotone", "signs": FEATURES.signs},
-}
 
 
 def drawn(config, seed=0):
@@ -64,37 +55,6 @@ def values(params, x, config, valid=None):
     valid = jnp.ones(T, bool) if valid is None else valid
     every = jnp.broadcast_to(valid, x.shape[:-1])
     return value(RewardModel(config), params, normaliser(), x, every)
-
-
-@pytest.mark.parametrize(
-    ("name", "gated"), [*zip(CONFIGS, [False, True] * 3, strict=True)]
-)
-def test_a_scene_in_one_pass_is_each_trajectory_by_itself(name, gated):
-    """Values and gradients of the Siamese pair, raw or by the effective module."""
-    columns = FEATURES.context if gated else ()
-    config = RewardConfig(**CONFIGS[name], scene_gating=columns)
-    x, valid = trajectories(), jnp.arange(T) < 11
-
-    own = RewardModel(config)
-
-    def apart(params):
-        return values(params, x, config, valid)
-
-    def together(params, model=own):
-        rows = x.transpose(2, 1, 0)
-        pair = rows[..., :1], rows[..., 1:]
-        found = model.apply({"params": params}, normaliser(), valid, *pair)
-        return jnp.concatenate(found)
-
-    def both(form):
-        total = lambda params: (jnp.sum(jnp.sin(form(params))), form(params))  # noqa: E731
-        return jax.jit(jax.grad(total, has_aux=True))(drawn(config))
-
-    near = lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-5)  # noqa: E731
-    jax.tree.map(near, both(together), both(apart))
-    effective = effective_params(drawn(config), config)
-    model = effective_model(effective, config.hidden_activation)
-    near(together(effective, model), apart(drawn(config)))
 
 
 def test_a_linear_reward_is_its_definition():
