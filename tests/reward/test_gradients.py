@@ -19,8 +19,7 @@ from rcirl_jax.reward.network import layers_of
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 from rcirl_jax.train.step import gradient_sums, loss_inputs
 from rcirl_jax.units import NUM_TIMES as T
-from tests.reward.compared import compared
-from tests.reward.test_losses import oracle
+from tests.reward.test_losses import compared, oracle
 
 F, B, K = 4, 3, 5
 STEP = 1e-6  # of the differences, in float64

@@ -5,12 +5,42 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.reward import LOSSES, LossConfig, loss_sums
+from rcirl_jax.reward import (
+    LOSSES,
+    CandidateInfo,
+    LossConfig,
+    LossInputs,
+    loss_sums,
+)
 from rcirl_jax.reward.losses import CEILING_M
-from tests.reward.compared import compared
 
 CONFIG = LossConfig()
 B, K = 6, 9
+
+
+def compared(human, candidates, feasible=None, weight=None, offset=0.0, **info):
+    """Values [B], [B, K] with plain facts unless given."""
+    human, candidates = jnp.asarray(human), jnp.asarray(candidates)
+    shape = candidates.shape
+    plain = {
+        "human_distance": jnp.zeros(shape[0]),
+        "human_collides": jnp.zeros(shape[0], bool),
+        "distance": jnp.zeros(shape),
+        "collides": jnp.zeros(shape, bool),
+        "breaks_rule": jnp.zeros(shape),
+        "human_density": jnp.zeros(shape[0]),
+        "density": jnp.zeros(shape),
+        "human_own": jnp.zeros(shape[0]),
+        "own": jnp.zeros(shape),
+    }
+    return LossInputs(
+        human=human,
+        candidates=candidates,
+        feasible=jnp.ones(shape, bool) if feasible is None else jnp.asarray(feasible),
+        weight=jnp.ones(shape[0]) if weight is None else jnp.asarray(weight),
+        info=CandidateInfo(**{**plain, **info}),
+        offset=jnp.asarray(offset),
+    )
 
 
 def drawn(seed=0):
