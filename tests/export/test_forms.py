@@ -22,13 +22,7 @@ F, T = 5, 7
 
 def reward(folder, hidden=(15,), activation="tanh", scene_gating=False, kernels=None):
     """A verified file of random weights, without an output bias."""
-    made = example_weights(
-        features=F,
-        times=T,
-        hidden=hidden,
-        activation=activation,
-        scene_gating=scene_gating,
-    )
+    made = example_weights(0, F, T, hidden, activation, scene_gating)
     biases = (*made.biases[:-1], np.zeros(1, np.float32))
     made = dataclasses.replace(made, biases=biases)
     if kernels is not None:
@@ -94,17 +88,12 @@ def value_of(document, x, valid):
 
 @pytest.mark.parametrize("nonnegative", [False, True])
 def test_yaml_of_a_linear_reward_is_its_cost(tmp_path, nonnegative):
-    kernels = None
+    made = reward(tmp_path, ())
     if nonnegative:
         weights = -np.random.default_rng(3).uniform(0.1, 1.0, size=(2 * F, 1))
         both = np.concatenate([np.eye(F), -np.eye(F)], axis=1)
         kernels = (both.astype(np.float32), weights.astype(np.float32))
-    made = reward(
-        tmp_path,
-        (2 * F,) if nonnegative else (),
-        "relu" if nonnegative else "tanh",
-        kernels=kernels,
-    )
+        made = reward(tmp_path, (2 * F,), "relu", kernels=kernels)
     document = yaml.safe_load(reward_yaml(made))
     x, valid = inputs()
     want = -made.value(x, np.broadcast_to(valid, x.shape[:2]))

@@ -37,9 +37,9 @@ def test_entries_of_other_types_are_one_line(tmp_path, monkeypatch, name, value)
         open_reward(str(path))
 
 
-@pytest.mark.parametrize("times", [TIMES_S[:10]])
-def test_times_that_no_trajectory_here_has(tmp_path, times):
+def test_times_that_no_trajectory_here_has(tmp_path):
     """The file itself is whole: only what ranks or drives here refuses it."""
+    times = TIMES_S[:10]
     made = weights_files.example_weights(features=len(SPECS), times=len(times))
     made = weights_files.of_the_preset(made, times=times.astype("f4"))
     path = tmp_path / "w.msgpack"
@@ -59,7 +59,7 @@ def run_on(folder, data, **flags):
     return folder
 
 
-@pytest.mark.parametrize("found", [[], "a\0b", ["a", None]])
+@pytest.mark.parametrize("found", [[], "a\0b"])
 def test_names_that_no_dataset_can_have(tmp_path, found):
     with pytest.raises(
         InputError, match=r"run\.json: flags\.data: .*expected a dataset"

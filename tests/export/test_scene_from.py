@@ -69,23 +69,6 @@ def test_limits_hold_from_their_point_and_are_braked_for():
     assert limit[44] == pytest.approx(np.sqrt(100.0 + 2.0 * 10.0), abs=0.3)
 
 
-def test_bodies_are_boxes_with_a_future():
-    across = Body(
-        kind="pedestrian", x=70.0, y=-5.0, heading=np.pi / 2, speed=1.0, length=0.6,
-        width=0.4,
-    )  # fmt: skip
-    made = built(obstacles=[LEAD, across])
-    lead, walker = made.obstacles
-    assert (lead.kind, walker.kind) == (Kind.VEHICLE, Kind.PEDESTRIAN)
-    assert lead.s_lower[0] == pytest.approx(28.0, abs=1e-3)
-    assert lead.s_upper[0] == pytest.approx(32.0, abs=1e-3)
-    assert (lead.l_lower[0], lead.l_upper[0]) == pytest.approx((-0.9, 0.9), abs=1e-3)
-    np.testing.assert_allclose(lead.speed, 8.0, atol=1e-4)
-    np.testing.assert_allclose(lead.s_lower, 28.0 + 8.0 * TIMES_S, atol=1e-2)
-    np.testing.assert_allclose(walker.l_lower, -5.3 + TIMES_S, atol=1e-3)
-    assert walker.s_upper[0] - walker.s_lower[0] == pytest.approx(0.4, abs=1e-3)
-
-
 def test_given_futures_take_the_place_of_predicted_ones():
     stops = [(0.0, 80.0, 0.0, 0.0), (2.0, 90.0, 0.0, 0.0), (4.0, 90.0, 1.0, 0.0)]
     behind = dataclasses.replace(LEAD, x=20.0)

@@ -41,13 +41,9 @@ def driven(weights, executor):
 
 def scored(weights, executor):
     """All arrays of a ranking of 16 scenes."""
-    made = score_scenes(
-        rows(),
-        np.arange(16),
-        RankingSetup(),
-        {"learned": open_reward(str(weights)).value},
-        executor=executor,
-    )
+    learned = {"learned": open_reward(str(weights)).value}
+    given = rows(), np.arange(16), RankingSetup(), learned
+    made = score_scenes(*given, executor=executor)
     return leaves([vars(made.outcomes), made.values, made.human_values])
 
 
@@ -60,14 +56,11 @@ def test_a_piece_is_its_part_of_the_whole(weights):
         np.testing.assert_array_equal(a, b[1:3])
 
 
-def assert_same_as_here(weights, there):
-    assert driven(weights, there) == driven(weights, Serial()), "suite"
-    for a, b in zip(scored(weights, there), scored(weights, Serial()), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 @pytest.mark.slow
 @pytest.mark.multiprocess
 def test_suites_and_rankings_do_not_depend_on_processes(weights):
     """As simulate and gate drive them, and evaluate ranks."""
-    assert_same_as_here(weights, Processes(2))
+    there, here = Processes(2), Serial()
+    assert driven(weights, there) == driven(weights, here)
+    for a, b in zip(scored(weights, there), scored(weights, here), strict=True):
+        np.testing.assert_array_equal(a, b)

@@ -70,15 +70,10 @@ def test_weights_of_one_shape_and_seed_are_told_apart_by_their_file(tmp_path):
 
 @pytest.mark.parametrize("track", ["full", "collision"])
 def test_a_gate_under_another_filter_has_left_something_out(track, tmp_path):
+    weights = str(random_weights(tmp_path / "w.msgpack"))
     job, _ = gate_job(
-        str(random_weights(tmp_path / "w.msgpack")),
-        "hand-set",
-        suite="full",
-        cases=None,
-        duration_s=None,
-        catalogue_seed=0,
-        plan_every=1,
-        track=track,
-    )
+        weights, "hand-set", suite="full", cases=None, duration_s=None,
+        catalogue_seed=0, plan_every=1, track=track,
+    )  # fmt: skip
     assert job.track == track
     assert ("only forbids collisions" in left_out(job)) is (track == "collision")

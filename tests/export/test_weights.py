@@ -249,14 +249,3 @@ def test_a_dial_multiplies_the_gain_and_nothing_else(tmp_path):
     save(tmp_path / "plain", plain, *example_samples(plain))
     with pytest.raises(InputError, match="plain: prior_cost: none: expected weights"):
         save_with_dial(tmp_path / "plain", 2.0, tmp_path / "none")
-
-
-def test_samples_of_other_weights_are_refused():
-    weights = example_weights()
-    features, valid, values = example_samples(weights)
-    values[2] += 1e-4 * max(1.0, abs(values[2]))
-    with pytest.raises(InputError, match=r"weights: samples\[2\]: scored"):
-        pack(weights, features, valid, values)
-    none = (features[:0], valid[:0], values[:0])
-    with pytest.raises(InputError, match=r"features.shape: \[0, 4, 3\]: expected"):
-        pack(weights, *none)
