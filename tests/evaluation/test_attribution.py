@@ -69,13 +69,6 @@ def test_linear_reward_gives_the_terms_of_its_sum():
     np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)
 
 
-def test_contributions_add_up_for_the_papers_network():
-    params = network(seed=2)
-    a, b = trajectories(2)
-    got = run(params, normaliser(), a, b, VALID, "tanh")
-    assert float(got.sum()) == pytest.approx(difference(params, a, b), rel=1e-3)
-
-
 def test_a_feature_counts_up_to_its_bound_and_one_that_does_not_differ_gets_nothing():
     params, (a, b) = network(), trajectories()
     a = a.at[:, 4].set(b[:, 4])

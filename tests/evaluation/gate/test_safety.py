@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import statistics
-import textwrap
 
 import numpy as np
 import pytest
@@ -67,21 +66,6 @@ def test_the_tail_is_the_sum_over_all_outcomes(gained, lost, n, margin):
     assert found == pytest.approx(worst, rel=1e-6)
 
 
-@pytest.mark.parametrize("q", [0.0005, 0.01])
-def test_a_driver_as_bad_as_the_margin_hardly_ever_passes(q):
-    """Size: at a loss of exactly the margin 2.5 % pass at most, whatever q is."""
-    margin, n, rng = 0.0025, 4140, np.random.default_rng(1)
-    draws = rng.multinomial(n, [q, q + margin, 1 - 2 * q - margin], size=2000)
-    known = {}
-    for gained, lost, _ in draws.tolist():
-        key = gained, lost
-        if key not in known:
-            known[key] = no_more_faults(gained, lost, n, margin) <= ALPHA
-    passed = sum(known[g, c] for g, c, _ in draws.tolist())
-    # P(more than 72 of 2,000 at 2.5 %) = 0.1 %
-    assert passed <= 72
-
-
 def test_how_many_cases_without_any_fault_it_takes():
     """At least those of (1 - m)^n <= 2.5 %, at most those of Tango's interval."""
     least = math.ceil(math.log(0.025) / math.log(1 - 0.0025))
@@ -110,22 +94,9 @@ def test_clearly_more_faults_are_refused_and_as_many_are_no_difference(field, na
     theirs = broken(drives(), spread(1, start=5), **{field: 1})
     verdict = decide(mine, theirs)
     assert verdict.decision == "do not ship"
-    assert failed(verdict) == {
-        name,
-        *(f"{name}, {trivial}" for trivial in TRIVIAL_BASELINES),
-    }
+    behind = {f"{name}, {trivial}" for trivial in TRIVIAL_BASELINES}
+    assert failed(verdict) == {name, *behind}
     assert verdict.look_at[0] == "family00/000@0"
-
-
-def test_a_few_new_faults_are_open_and_named():
-    """Five lost and none gained: p = 0.06, but not less than ten for certain."""
-    verdict = decide(smoother(broken(drives(), spread(5), at_fault=1)), drives())
-    assert verdict.decision == "could not judge"
-    assert check_of(verdict, "collision").outcome == "open"
-    assert verdict.sentence.endswith(
-        "Next: look at the new faults; --accept those that may stay."
-    )
-    assert "family00/097@0: preventable at-fault" in format_verdict(verdict)
 
 
 def test_a_collision_that_nobody_prevents_is_listed_and_not_counted():
@@ -153,25 +124,22 @@ def test_more_of_an_offence_that_both_commit_is_new():
     assert decide(both, both).new_faults == ()
 
 
-def test_an_accepted_case_does_not_count():
+def test_a_few_new_faults_are_open_and_an_accepted_case_does_not_count():
+    """Five lost and none gained: p = 0.06, but not less than ten for certain."""
     mine, theirs = smoother(broken(drives(), spread(5), at_fault=1)), drives()
-    ids = [fault.case for fault in decide(mine, theirs).new_faults]
+    verdict = decide(mine, theirs)
+    assert verdict.decision == "could not judge"
+    assert check_of(verdict, "collision").outcome == "open"
+    assert "family00/097@0: preventable at-fault" in format_verdict(verdict)
+    ids = [fault.case for fault in verdict.new_faults]
     verdict = decide(mine, theirs, accept=tuple(ids[:2]))
     check = check_of(verdict, "collision")
     assert (check.outcome, check.lost) == ("pass", 3)
     assert verdict.decision == "ship"
     assert [fault.accepted for fault in verdict.new_faults] == [True] * 2 + [False] * 3
-    assert (
-        "the candidate loses nothing against the incumbent, but for accepted faults in "
-        f"{ids[0]}, {ids[1]}." in verdict.sentence
-    )
-    named = decide(mine, theirs, accept=tuple(ids[:3])).sentence
-    assert all(case in named for case in ids[:3])
-    assert len(textwrap.wrap(named, 100)) <= 3
-    some, none = f"expected some of {ids[0]}, ", "expected none, for there is none"
-    for candidate, says in ((mine, some), (drives(), none)):
-        with pytest.raises(InputError, match=f"accept: family01/000@1: .*{says}"):
-            decide(candidate, theirs, accept=("family01/000@1",))
+    assert f"but for accepted faults in {ids[0]}, {ids[1]}." in verdict.sentence
+    with pytest.raises(InputError, match=r"accept: family01/000@1: .*expected some of"):
+        decide(mine, theirs, accept=("family01/000@1",))
 
 
 @pytest.mark.parametrize(
@@ -206,13 +174,10 @@ def test_what_was_not_measured_is_open_and_says_what_to_do():
     mine = smoother(drives())
     verdict = judge(pair(mine, drives(), likeness=None), GateConfig())
     assert verdict.decision == "could not judge"
-    unmeasured = [c.name for c in verdict.checks if not c.measured]
-    assert unmeasured == [
-        *(f"likeness, {name}" for name in TRIVIAL_BASELINES),
-        "likeness",
-    ]
+    unmeasured = {c.name for c in verdict.checks if not c.measured}
+    trivial = {f"likeness, {name}" for name in TRIVIAL_BASELINES}
+    assert unmeasured == {"likeness", *trivial}
     assert "Next: measure human-likeness" in verdict.sentence
-    assert "not measured" in format_verdict(verdict)
     verdict = judge(pair(mine, drives(), rows={}), GateConfig())
     assert verdict.decision == "could not judge"
     assert "drive constant V on the same cases" in verdict.reasons[0]
@@ -239,14 +204,10 @@ def test_the_candidate_is_nearer_than_every_trivial_baseline(factors, outcome):
     assert verdict.decision == decisions[outcome]
 
 
-def judge_by(known):
-    """Two rewards that drive alike."""
-    return judge(pair(drives(), drives(), likeness=known), GateConfig())
-
-
 def test_nearer_to_the_human_is_a_gain_and_farther_a_loss():
     nearer, farther = (likeness(candidate=factor) for factor in (0.9, 1.1))
-    assert judge_by(nearer).decision == "ship"
+    verdict = judge(pair(drives(), drives(), likeness=nearer), GateConfig())
+    assert verdict.decision == "ship"
     verdict = judge(pair(smoother(drives()), drives(), likeness=farther), GateConfig())
     assert failed(verdict) == {"likeness"}
 
@@ -257,48 +218,15 @@ def test_the_interval_of_likeness_is_over_recordings():
     distance = dict(known.distance)
     factor = np.where(known.clusters == 0, 0.5, 1.0)
     distance["candidate"] = factor * np.asarray(distance["incumbent"])
-    verdict = judge_by(dataclasses.replace(known, distance=distance))
+    near = dataclasses.replace(known, distance=distance)
+    verdict = judge(pair(drives(), drives(), likeness=near), GateConfig())
     gains = [c for c in verdict.checks if c.kind == "gain" and c.name == "likeness"]
     assert gains[0].difference > 0.0
     assert gains[0].outcome == "open"
     alone = dataclasses.replace(known, clusters=known.clusters % 3)
-    few = judge_by(alone)
+    few = judge(pair(drives(), drives(), likeness=alone), GateConfig())
     assert few.decision == "could not judge"
     assert any("3 vehicles are too few" in reason for reason in few.reasons)
-
-
-def unlike(seed, count, farther):
-    """All drives that there are, which scatter as those of real rewards do.
-
-    With 240 the interval reaches 0.12 of the mean to each side.
-    """
-    rng = np.random.default_rng(seed)
-    hard = rng.lognormal(sigma=0.8, size=count)
-    distance = {
-        name: factor * hard * rng.lognormal(sigma=0.45, size=count)
-        for name, factor in (("candidate", 1.0 + farther), ("incumbent", 1.0))
-    }
-    clusters = np.arange(count) // 3 * 2 + np.arange(count) % 3 // 2
-    return Likeness(distance=distance, clusters=clusters, available=count)
-
-
-def test_what_is_farther_from_people_hardly_ever_ships():
-    """Of twenty draws each, as near as the incumbent and 5, 10 and 25 % farther."""
-    both = pair(smoother(drives()), drives())
-    config = GateConfig(trivial_baselines=(), primary=("j_station",))
-    shipped = [
-        sum(
-            judge(
-                dataclasses.replace(both, likeness=unlike(seed, 240, farther)), config
-            ).decision
-            == "ship"
-            for seed in range(20)
-        )
-        for farther in (0.0, 0.05, 0.1, 0.25)
-    ]
-    assert shipped[0] >= 6
-    most = (20, 3, 1, 0)
-    assert all(n <= limit for n, limit in zip(shipped, most, strict=True)), shipped
 
 
 @pytest.mark.parametrize(

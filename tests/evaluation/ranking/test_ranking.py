@@ -15,8 +15,6 @@ from rcirl_jax.evaluation.ranking.metrics import (
     METRICS,
     Outcomes,
     fit_temperature,
-    oracle_fde,
-    oracle_scorer,
     random_scorer,
     scene_metrics,
 )
@@ -39,7 +37,9 @@ def integer_values(seed, outcomes):
     rng = np.random.default_rng(seed)
     shape = outcomes.fde.shape
     values = rng.integers(0, 4, shape).astype(float)
-    values[~outcomes.feasible] = np.nan  # must never be read
+    # must never be read, and wins and loses nothing
+    odd = rng.choice([np.nan, -1e9, 1e9], shape)
+    values = np.where(outcomes.feasible, values, odd)
     return values, rng.integers(0, 4, shape[0]).astype(float)
 
 
@@ -127,29 +127,6 @@ def test_random_scorer_is_at_chance_and_repeats():
     assert got["mrr"].mean() == pytest.approx(harmonic, abs=0.02)
 
 
-@given(seed=st.integers(0, 10**6))
-def test_no_scorer_beats_the_oracle(seed):
-    o = make(seed)
-    best = scene_metrics(*oracle_scorer(o), o)["top1_fde"]
-    np.testing.assert_array_equal(best, oracle_fde(o))
-    other = scene_metrics(*random_scorer(seed, o.fde.shape), o)
-    assert np.all(other["top1_fde"] >= best)
-    assert np.all(other["top3_fde"] >= best)
-
-
-def test_pairs_are_counted_behind_the_mask():
-    """Whatever an infeasible candidate is worth, it is no pair and wins none."""
-    o = make(3)
-    values, human = random_scorer(1, o.fde.shape)
-    pairs = o.feasible.sum(axis=1)
-    below = np.sum(o.feasible & (values < human[:, None]), axis=1)
-    for worth in (-1e9, 1e9):
-        found = scene_metrics(np.where(o.feasible, values, worth), human, o)
-        np.testing.assert_array_equal(found["num_pairs"], np.maximum(pairs, 1))
-        share = below / np.maximum(pairs, 1)
-        np.testing.assert_allclose(found["pairwise_accuracy"], share)
-
-
 def mean_nll(values, o, temperature):
     some = o.feasible.any(axis=1)
     found = scene_metrics(values, np.zeros(len(values)), o, temperature)
@@ -186,16 +163,11 @@ def test_bad_input_is_one_clear_line():
     o = make(1)
     values, human = random_scorer(0, o.fde.shape)
     o = dataclasses.replace(o, feasible=np.ones_like(o.feasible))
-    for broken, unknown in (
-        (np.nan, human),
-        (np.inf, human),
-        (0.5, np.full(30, np.nan)),
-    ):
-        wrong = values.copy()
-        wrong[4:, 0] = broken
-        first = 0 if np.isnan(unknown).any() else 4
-        with pytest.raises(InputError, match=f"scenes, first {first}"):
-            scene_metrics(wrong, unknown, o)
+    with pytest.raises(InputError, match="scenes, first 0"):
+        scene_metrics(values, np.full(30, np.nan), o)
+    values[4:, 0] = np.inf
+    with pytest.raises(InputError, match="scenes, first 4"):
+        scene_metrics(values, human, o)
     nothing = dataclasses.replace(o, feasible=np.zeros_like(o.feasible))
     with pytest.raises(InputError, match="no scene has a candidate"):
         fit_temperature(values, nothing)

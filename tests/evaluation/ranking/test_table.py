@@ -27,9 +27,7 @@ from rcirl_jax.evaluation.ranking.report import (
     to_json,
     verdict,
 )
-from rcirl_jax.evaluation.statistics import (
-    Difference,
-)
+from rcirl_jax.evaluation.statistics import Difference
 
 SCENES, CANDIDATES, VEHICLES = 240, 12, 40
 
@@ -195,8 +193,7 @@ def test_json_is_plain_versioned_and_complete(report):
     assert set(made["rows"]["rc-irl"]) == set(METRICS) == set(made["metrics"])
     found = dataclasses.asdict(report.rows["rc-irl"]["top1_fde"])
     assert made["rows"]["rc-irl"]["top1_fde"] == pytest.approx(found, rel=1e-8)
-    assert len(made["comparisons"]) == len(report.comparisons)
-    assert from_json(made).counts == report.counts
+    assert to_json(from_json(made)) == made
     with pytest.raises(InputError, match=r"report: schema: .*, 2\): expected .*, 1\)"):
         from_json({**made, "schema_version": 2, "added": 1})
     broken = dataclasses.replace(report.oracle_floor, se=float("nan"))
@@ -209,19 +206,9 @@ def test_a_row_that_is_not_ahead_of_an_easy_one_is_told(scorers, outcomes, repor
     assert not ranking_warnings(report, ["rc-irl"], easy)
     (same,) = ranking_warnings(report, ["twin"], easy)  # as noisy as hand-set
     assert same.startswith("ranking: twin is not shown to be better than hand-set, ")
-    assert "random" not in same
-    worst = {
-        **scorers,
-        "twin": [scene_metrics(outcomes.fde, outcomes.fde[:, 0], outcomes)],
-    }
-    found = build_report(ranked(worst, outcomes))
+    worst = scene_metrics(outcomes.fde, outcomes.fde[:, 0], outcomes)
+    found = build_report(ranked({**scorers, "twin": [worst]}, outcomes))
     said = ranking_warnings(found, ["twin"], easy)
-    (apart,) = (
-        c.difference for c in found.comparisons
-        if (c.row, c.reference, c.metric) == ("twin", "random", "top1_fde")
-    )  # fmt: skip
-    assert f"worse than random, top-1 {apart.mean:+.2f} [" in said[0]
-    assert "worse than hand-set" in said[0]
-    again = dataclasses.replace(found, warnings=said)
-    assert from_json(to_json(again)).warnings == said
-    assert "warning: ranking: twin is worse" in format_table(again)
+    again = from_json(to_json(dataclasses.replace(found, warnings=said)))
+    assert "warning: ranking: twin is worse than hand-set, " in format_table(again)
+    assert "worse than random, " in again.warnings[0]
