@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.errors import InputError
 from rcirl_jax.train.checkpoint import (
     DAMAGED,
     DIGESTS,
@@ -105,15 +104,6 @@ def test_steps_after_a_damaged_one_are_saved_again(folder, state):
         checkpoints.save(at(state, 4), {"epoch": 0, "index": 4})
         checkpoints.close()
         assert restored(folder, state) == (4, [])
-
-
-def test_no_whole_one_is_one_line_and_nothing_is_touched(folder):
-    for step in "234":
-        (folder / step / "state" / "manifest.ocdbt").write_bytes(b"")
-    before = files_of(folder)
-    with pytest.raises(InputError, match=r"checkpoint 4: state/manifest\.ocdbt: damag"):
-        Checkpoints(folder)
-    assert files_of(folder) == before
 
 
 def test_who_only_reads_leaves_everything_as_it_is(folder, state, tmp_path):

@@ -136,13 +136,6 @@ def age(folder, by_s):
             os.utime(path, (when, when))
 
 
-def test_rows_read_through_a_window_give_the_same_weights(
-    dataset, undisturbed, tmp_path
-):
-    found = trained(dataset, tmp_path, in_memory_mb=0.0)
-    assert_same_bits(found.state, undisturbed.state)
-
-
 def test_the_time_of_day_decides_nothing(dataset, undisturbed, tmp_path, monkeypatch):
     """Orbax gives up a save that took 300 s of it: one line, the same bits again."""
     clock, ends, result = Clock(), [], None

@@ -19,7 +19,13 @@ from rcirl_jax.export.forms import exported_run
 from rcirl_jax.export.from_run import export_run, read_config, verification_samples
 from rcirl_jax.export.loading import load_runs
 from rcirl_jax.features import feature_map
-from rcirl_jax.reward import RewardConfig, RewardModel, fit_normaliser, value
+from rcirl_jax.reward import (
+    RewardConfig,
+    RewardModel,
+    fit_normaliser,
+    seen_range,
+    value,
+)
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train import featurise
 from rcirl_jax.train.featurise import normaliser_rows
@@ -93,6 +99,8 @@ def test_export_and_rank(dataset, run, tmp_path):
     assert reward.provenance["config"] == config
     assert reward.provenance["dataset_sha256"] == dataset.hash
     assert reward.provenance["steps"] == int(run[1].state.step)
+    seen = seen_range(normaliser_rows(dataset, CONFIG), feature_map(CONFIG.features))
+    np.testing.assert_array_equal(reward.training_range, seen)  # what the guard knows
     learned, setup = load_runs([reward.file])
     setup = dataclasses.replace(setup, sampler=SMALL)
     report = evaluate_ranking(dataset, learned, setup)

@@ -49,13 +49,9 @@ def test_pairs_won_are_those_of_the_last_steps(tmp_path):
     lines = [line(1), line(2, pairs=10.0, pair_accuracy=0.5), line(3, pairs=30.0)]
     path = write(tmp_path, lines)
     assert pairs_won(path, 2) == pytest.approx((10 * 0.5 + 30 * 0.75) / 40)
-    with pytest.raises(InputError, match=r"metrics\.jsonl: 3 whole lines.*expected 4"):
-        pairs_won(path, 4)
     write(tmp_path, [line(1), line(2, pairs=None)])
     with pytest.raises(InputError, match="1 whole lines at its end: expected 2"):
         pairs_won(path, 2)
-    with pytest.raises(InputError, match=r"nowhere\.jsonl: 0 whole lines"):
-        pairs_won(tmp_path / "nowhere.jsonl", 1)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import score_of
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.features import feature_map
@@ -18,7 +17,7 @@ from rcirl_jax.planner.safety import check
 from rcirl_jax.train.featurise import candidates_of, featurise, host_batch
 from rcirl_jax.train.loop import restore_run, train
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.train.step import init_state, loss_inputs, make_train_step
+from rcirl_jax.train.step import init_state, loss_inputs
 from rcirl_jax.types import Tag
 from tests.helpers.stored import rows_of
 from tests.train.test_step import SMALL, normaliser
@@ -93,23 +92,6 @@ def test_what_is_compared_is_beta_own_plus_v(made):
     np.testing.assert_allclose(both.human, expected, rtol=1e-5, atol=1e-5)
 
 
-def test_seven_times_the_cost_learns_the_same():
-    """In its own unit a cost is the same cost, also plus a constant."""
-    found = []
-    for name, unit in (("headway_cost", 0.5), ("seven_and_three", 3.5)):
-        place = f"tests/planner/costs/costs.py:{name}"
-        config = dataclasses.replace(CONFIG, residual_on=place, own_unit=unit)
-        state, step = init_state(config, normaliser()), make_train_step(config)
-        given, step = batch(), jax.jit(step)
-        for _ in range(3):
-            state, metrics = step(state, given)
-            assert bool(metrics.finite)
-        found.append(state.params)
-    assert float(found[0]["log_beta"]) != 0.0
-    for one, two in zip(*map(jax.tree.leaves, found), strict=True):
-        np.testing.assert_allclose(one, two, rtol=2e-3, atol=2e-4)
-
-
 def test_the_file_says_the_gain_that_was_learned(simulated, tmp_path):
     config = dataclasses.replace(CONFIG, epochs=1, own_unit=0.5)
     config = dataclasses.replace(
@@ -125,10 +107,3 @@ def test_the_file_says_the_gain_that_was_learned(simulated, tmp_path):
     assert reward.provenance["own_cost"]["sha256"] == own.sha256
     _, params = score_of(reward, own)
     assert float(params.gain) == pytest.approx(prior.gain)
-
-
-def test_a_residual_ranks_what_a_planner_could_drive():
-    with pytest.raises(InputError, match="positive: human: expected nearest"):
-        TrainConfig(residual_on="hand-set")
-    with pytest.raises(InputError, match=r"slowed: \[1.5\]: expected shares"):
-        TrainConfig(slowed=(1.5,))
