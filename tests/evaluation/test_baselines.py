@@ -1,5 +1,6 @@
 """Tuned baselines: the searches, what they minimise, and their rows."""
 
+import dataclasses
 import functools
 
 import jax
@@ -24,26 +25,22 @@ from rcirl_jax.evaluation.baselines import (
 )
 from rcirl_jax.evaluation.ranking.score import (
     RankingSetup,
-    candidates_key,
     measure_scenes,
+    score_scenes,
 )
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm, closeness, idm_trajectory
 from rcirl_jax.reward import (
     TUNABLE,
     LatticeCost,
-    lattice_cost,
     tuned,
 )
 from rcirl_jax.reward.hand import LatticeTerms
-from rcirl_jax.sampling import SamplerConfig, num_candidates, sample
-from tests.evaluation.driven import mean_chosen_fde, scored_baselines
-from tests.helpers.scenes import T, unfused
+from rcirl_jax.sampling import SamplerConfig, num_candidates
+from tests.helpers.scenes import T
 from tests.helpers.stored import long_rows
 
 D = len(TUNABLE)
 SMALL = SamplerConfig(num_random=16, cruise_times=(4.0,), edge_times=(4.0,))
-SCENES = 40
-INDEX = np.arange(SCENES)
 
 
 # ------------------------------------------------------------------ the searches
@@ -131,24 +128,10 @@ def test_an_equal_budget_is_in_queries(monkeypatch):
 # -------------------------------------------------------------------- the cost
 
 
-@functools.cache
-def some_rows():
-    """Demonstrations in random scenes, all of 8 s, and their candidates [S, K]."""
-    rows = long_rows(SCENES)
-    make = jax.jit(jax.vmap(lambda i, s: sample(candidates_key(i), s, SMALL)))
-    return rows, make(INDEX, rows.scene)
-
-
 def test_zeros_are_apollos_weights_exactly():
     weights = tuned(jnp.zeros(D))
     for name, value in LatticeCost().fields().items():
         assert float(getattr(weights, name)) == float(value)
-    rows, candidates = some_rows()
-    pick = lambda tree, *at: jax.tree.map(lambda x: jnp.asarray(x)[at], tree)  # noqa: E731
-    drive = pick(rows.scene, 1), pick(candidates.trajectory, 1, 20)
-    cost = unfused(lambda fields, *x: lattice_cost(*x, LatticeCost(**fields)))
-    found, wanted = (cost(w.fields(), *drive) for w in (weights, LatticeCost()))
-    assert float(found) == float(wanted)
 
 
 def random_ranked(scenes, candidates, seed=0):
@@ -197,6 +180,7 @@ def test_mean_fde_against_numpy_in_any_company():
 
 OF_DRIVER = 24
 DRIVEN = np.arange(OF_DRIVER)
+SETUP = RankingSetup(sampler=SMALL, horizon_s=8.0, futures="recorded")
 HIDDEN_DRIVER = np.array([0.5, 0.3, -0.8, -0.5, -0.4])
 
 
@@ -218,6 +202,20 @@ def driven_by_a_hidden_driver():
     return rows.replace(human=human)
 
 
+def scored_baselines(rows, tuned):
+    """`score_scenes` of the baselines alone, at 8 s."""
+    runs = {name: [baseline] for name, baseline in tuned.items()}
+    scored = score_scenes(rows, DRIVEN, dataclasses.replace(SETUP, tuned=runs), {})
+    values = {name.removesuffix("#0"): x for name, x in scored.values.items()}
+    return dataclasses.replace(scored, values=values)
+
+
+def mean_chosen_fde(scored, name):
+    """m, of the feasible candidate that a row values most."""
+    values = np.where(scored.outcomes.feasible, scored.values[name], -np.inf)
+    return scored.outcomes.fde[np.arange(len(values)), values.argmax(axis=1)].mean()
+
+
 def test_zeros_are_the_usual_driver_and_bounds_hold():
     usual = idm_of(jnp.zeros(len(TUNABLE_IDM)))
     for name, value in Idm().fields().items():
@@ -231,12 +229,10 @@ def test_zeros_are_the_usual_driver_and_bounds_hold():
 
 
 def test_the_search_comes_close_to_a_hidden_driver_by_what_the_report_measures():
-    rows, hidden = (
-        driven_by_a_hidden_driver(),
-        idm_of(jnp.asarray(HIDDEN_DRIVER, jnp.float32)),
-    )
+    rows = driven_by_a_hidden_driver()
+    hidden = idm_of(jnp.asarray(HIDDEN_DRIVER, jnp.float32))
     tuned = {TUNED_IDM_ROW: hidden, "again": Idm(), "cost": LatticeCost()}
-    scored = scored_baselines(rows, SMALL, tuned)
+    scored = scored_baselines(rows, tuned)
     np.testing.assert_allclose(
         scored.values["again"], scored.values["IDM"], rtol=1e-5, atol=1e-4
     )
@@ -259,9 +255,8 @@ def test_the_search_comes_close_to_a_hidden_driver_by_what_the_report_measures()
 def test_distances_alone_are_those_of_the_scores():
     """What an import's oracle floor measures, over a padded chunk."""
     rows = driven_by_a_hidden_driver()
-    scored = scored_baselines(rows, SMALL, {})
-    setup = RankingSetup(sampler=SMALL, horizon_s=8.0, futures="recorded")
-    near = measure_scenes(rows, DRIVEN, setup)
+    scored = scored_baselines(rows, {})
+    near = measure_scenes(rows, DRIVEN, SETUP)
     for name in ("feasible", "fde", "ade"):
         found, wanted = getattr(near, name), getattr(scored.outcomes, name)
         np.testing.assert_allclose(found, wanted, atol=1e-4)
