@@ -21,12 +21,7 @@ from rcirl_jax.planner.dp import (
     search,
     smoothed,
 )
-from rcirl_jax.planner.rank import (
-    RankConfig,
-    learned_score,
-    ranking,
-    ranking_score,
-)
+from rcirl_jax.planner.rank import RankConfig, learned_score, ranking, ranking_score
 from rcirl_jax.reward import RewardConfig, effective_params, init_params
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.sampling.sampler import as_candidates
@@ -37,7 +32,6 @@ from tests.helpers.scenes import random_scene
 FEATURES = feature_map("paper21")
 SHAPE = RewardConfig()
 COARSE = DpConfig(step=4.0, max_speed=26.0, max_way=160.0)
-MIDDLE = DpConfig(step=2.0, max_speed=26.0, max_way=160.0)
 
 
 @functools.cache
@@ -74,11 +68,6 @@ def best(scene, w, config, **objective):
     return jax.tree.map(lambda x: x[0], plans)
 
 
-@jax.jit
-def network_value(scene, trajectory, w):
-    return SCORE(w, scene, as_candidates(trajectory))[0]
-
-
 def scene_of(seed):
     made = jax.tree.map(jnp.asarray, random_scene(seed))
     valid = jnp.ones_like(made.time_valid)
@@ -89,20 +78,6 @@ def scene_of(seed):
         ego=made.ego.replace(v=v, a=jnp.clip(made.ego.a, -1.0, 1.0)),
         path=made.path.replace(speed_limit=limit),
     )
-
-
-def test_value_of_the_plan_is_the_networks_own():
-    feasible = 0
-    for seed in range(6):
-        made, own = scene_of(seed), weights(seed, scene_gating=True)
-        plan = planner(MIDDLE)(made, own)
-        feasible += bool(plan.feasible)
-        again = float(network_value(made, plan.trajectory, own))
-        if bool(plan.feasible):
-            assert float(plan.value) == pytest.approx(again, rel=1e-4, abs=1e-4)
-        else:
-            assert float(plan.value) < -1e4
-    assert feasible >= 3
 
 
 def free(made):
@@ -166,21 +141,6 @@ def test_equals_brute_force_on_a_small_lattice(seed):
     np.testing.assert_array_equal(np.asarray(plan.n)[:6], best[:6])
 
 
-def test_walls_and_bodies_are_not_entered():
-    for seed in range(6):
-        made = scene_of(seed)
-        plan = planner(MIDDLE)(made, weights(seed, scene_gating=True))
-        if not bool(plan.feasible):
-            continue
-        # a body that overlaps the ego from behind at t = 0 is not the plan's to avoid
-        o = made.obstacles
-        behind = 0.5 * (o.s_lower[:, 0] + o.s_upper[:, 0]) < made.ego.s
-        ahead = made.replace(obstacles=o.replace(valid=o.valid & ~behind[:, None]))
-        row = VALUES(ahead, plan.trajectory)
-        names = FEATURES.names
-        assert float(row[1:, names.index("collision_distance")].min()) > 0.0
-
-
 def total(made, trajectory, w, own, gain):
     """V_own + gain V of one trajectory, as the planner values it."""
     one = as_candidates(trajectory)
@@ -191,21 +151,33 @@ def total(made, trajectory, w, own, gain):
 RANKED = jax.jit(ranking_score(FEATURES, SHAPE.activation))
 
 
+def nearest_body(made, trajectory):
+    """m to who is ahead at t = 0; who comes from behind is not the plan's to avoid."""
+    o = made.obstacles
+    behind = 0.5 * (o.s_lower[:, 0] + o.s_upper[:, 0]) < made.ego.s
+    ahead = made.replace(obstacles=o.replace(valid=o.valid & ~behind[:, None]))
+    row = VALUES(ahead, trajectory)
+    return float(row[1:, FEATURES.names.index("collision_distance")].min())
+
+
 @pytest.mark.parametrize("own", ["+velocity", "hand-set DP"])
 def test_an_own_cost_that_is_a_sum_is_searched_exactly(own):
-    """The recursion adds up what the planner's score says of the plan."""
+    """The recursion adds up what the planner's score says; nobody is run into."""
     gain, found = 3.0, 0
     plan_of = jax.jit(lambda made, w: best(made, w, COARSE, gain=gain, own=own))
-    for seed in range(5):
-        made, w = scene_of(seed), weights(seed)
+    for seed in range(6):
+        made, w = scene_of(seed), weights(seed, scene_gating=True)
         plan = plan_of(made, w)
-        if bool(plan.feasible):
-            found += 1
-            value = total(made, plan.trajectory, w, own, gain)
-            if own == "+velocity":  # all plans have the same speed at t = 0
-                value -= float(made.ego.v) / 18
-            assert float(plan.value) == pytest.approx(value, rel=1e-4, abs=1e-4)
-    assert found >= 2
+        if not bool(plan.feasible):
+            assert float(plan.value) < -1e4
+            continue
+        found += 1
+        value = total(made, plan.trajectory, w, own, gain)
+        if own == "+velocity":  # all plans have the same speed at t = 0
+            value -= float(made.ego.v) / 18
+        assert float(plan.value) == pytest.approx(value, rel=1e-4, abs=1e-4)
+        assert nearest_body(made, plan.trajectory) > 0.0
+    assert found >= 3
 
 
 def test_a_search_is_by_the_own_cost_where_v_does_not_know_the_scene(monkeypatch):
@@ -235,9 +207,7 @@ def test_ratios_are_linear_about_the_reference():
     """A step away from it, the sum moves by as much as Apollo's cost does."""
     made = free(scene_of(2))
     w, s0, v0 = weights(2), float(made.ego.s), 10.0
-    made = made.replace(
-        ego=made.ego.replace(v=jnp.asarray(v0), a=jnp.asarray(0.0)),
-    )
+    made = made.replace(ego=made.ego.replace(v=jnp.asarray(v0), a=jnp.asarray(0.0)))
     lattice = DpConfig(step=1.0, max_speed=26.0, max_way=200.0)
     m0, on_path = round(v0 / lattice.speed_step), jax.jit(trajectory_on_path)
 

@@ -3,12 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from rcirl_jax.planner.mobil import Mobil, chosen_lane
 from rcirl_jax.simulation.rollout import first_scenes
-from rcirl_jax.simulation.rows import mobil_row
-from tests.simulation.drives import drive, stack
+from tests.simulation.drives import stack
 from tests.simulation.worlds import make_case
 
 SLOW = {"s": 40.0, "v": 6.0, "desired": 6.0}
@@ -63,16 +61,3 @@ def test_a_lane_that_ends_is_left():
     at = np.arange(2304) * 2.0
     right = np.where(at < 60.0, -5.75, -1.75)
     assert lane(scene_of(lanes=(0, 1), path_l=-3.5, route_right=right)) == 0
-
-
-def test_it_passes_a_slow_car_and_stays_behind_one_where_it_cannot():
-    cases = [make_case([SLOW], speed=15.0, limit=20.0, lanes=lanes)
-             for lanes in ((1, 0), (0, 0))]  # fmt: skip
-    row = mobil_row()
-    record, _ = drive(cases, 250, policy=row.policy, params=row.params)
-    assert record.collision.sum() == 0
-    assert record.l[0, -1] == pytest.approx(3.5, abs=0.1)
-    assert np.abs(record.l[1]).max() < 0.05
-    assert record.v[0, -1] > 18.0
-    assert record.v[1, -1] == pytest.approx(6.0, abs=0.5)
-    assert np.abs(record.v**2 * record.curvature).max() < 4.0

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.planner.dp import emergency_stop, optimality_gap
-from rcirl_jax.planner.rank import (
-    ONLINE,
-)
+from rcirl_jax.planner.rank import ONLINE
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.sampling.sampler import as_candidates
 from rcirl_jax.units import TIMES_S

@@ -166,38 +166,29 @@ def speeding_up(begin=0.0, first=0):
 
 
 @pytest.mark.parametrize(
-    ("v", "seconds"),
+    ("v", "blocked", "seconds"),
     [
-        (speeding_up(), 4.0),  # to 8 m/s
-        (speeding_up(1.0), -1.0),  # it did not stand
-        (np.minimum(speeding_up(), 7.9), 9.9),  # never: to the record's end
-        (np.r_[speeding_up()[:50], speeding_up(first=10)[:50]], 4.9),  # twice
+        (speeding_up(), slice(0), 4.0),  # to 8 m/s
+        (speeding_up(1.0), slice(0), -1.0),  # it did not stand
+        (np.minimum(speeding_up(), 7.9), slice(0), 9.9),  # never: to the record's end
+        (np.r_[speeding_up()[:50], speeding_up(first=10)[:50]], slice(0), 4.9),  # twice
+        # it stands for 3 s and is at 8 m/s after 7 s; the road is not free
+        (speeding_up(first=30), slice(40, 45), -1.0),  # on the way
+        (speeding_up(first=30), slice(20, 25), 4.5),  # while it stands
+        (speeding_up(first=30), slice(0, 10), 6.0),  # a red light, 2 s more of standing
+        (speeding_up(first=30), slice(70, None), 7.0),  # when it has started already
     ],
 )
-def test_time_of_the_longest_start(v, seconds):
-    limit = np.full(S, 10.0, np.float32)
-    found = measured(v=v.astype(np.float32), speed_limit=limit)
-    assert found.start_time == pytest.approx(seconds)
-    ended = np.arange(S) < 31  # a start ends with the drive
+def test_time_of_the_longest_start_on_a_free_road(v, blocked, seconds):
+    drive = {"v": v.astype(np.float32), "speed_limit": np.full(S, 10.0, np.float32)}
+    drive["free_way"] = at(blocked, 39.0, np.inf)
+    assert measured(**drive).start_time == pytest.approx(seconds)
+
+
+def test_a_start_ends_with_the_drive():
+    limit, ended = np.full(S, 10.0, np.float32), np.arange(S) < 31
     found = measured(v=speeding_up(), speed_limit=limit, valid=ended)
     assert found.start_time == pytest.approx(3.0)
-
-
-@pytest.mark.parametrize(
-    ("blocked", "seconds"),
-    [
-        (slice(40, 45), -1.0),  # on the way
-        (slice(20, 25), 4.5),  # while it stands
-        (slice(0, 10), 6.0),  # a red light, and 2 s more of standing
-        (slice(70, None), 7.0),  # when 80 % are reached already
-    ],
-)
-def test_a_start_counts_on_a_free_road_only(blocked, seconds):
-    """It stands for 3 s and is at 8 m/s after 7 s."""
-    way = at(blocked, 39.0, np.inf)
-    limit = np.full(S, 10.0, np.float32)
-    found = measured(v=speeding_up(first=30), speed_limit=limit, free_way=way)
-    assert found.start_time == pytest.approx(seconds)
 
 
 def test_sign_changes_of_the_acceleration_a_second():

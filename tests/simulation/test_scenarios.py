@@ -3,25 +3,18 @@
 import functools
 import pathlib
 import tomllib
-from typing import Any
 
 import jax
 import numpy as np
 import pytest
-import shapely
 
-from rcirl_jax.simulation.cases import (
-    NUM_AGENTS,
-    NUM_PHASES,
-    NUM_ROAD,
-    ROAD_STEP_M,
-    Case,
-)
+from rcirl_jax.simulation.cases import NUM_AGENTS, NUM_PHASES, NUM_ROAD, ROAD_STEP_M
 from rcirl_jax.simulation.catalogue import build_cases, family_names, load_family
 from rcirl_jax.types import Kind
+from tests.simulation.test_judge import polygon
 
-ROOT = pathlib.Path(__file__).parents[2]
-FILES = sorted((ROOT / "data_specs" / "scenarios").glob("*.toml"))
+FOLDER = pathlib.Path(__file__).parents[2] / "data_specs" / "scenarios"
+FILES = sorted(FOLDER.glob("*.toml"))
 NAMES = [file.stem for file in FILES]
 CASES = 180  # of a family in the suite `full`
 MAX_CURVATURE = 0.1  # 1/m, simulation.md 3.8 row 1
@@ -29,33 +22,19 @@ LANE_TILT = 0.17  # sin of the heading below which an agent keeps a lane
 
 
 @functools.cache
-def text(name: str) -> dict[str, Any]:
-    """The file as written, without the loader."""
-    with (ROOT / "data_specs" / "scenarios" / f"{name}.toml").open("rb") as file:
-        return tomllib.load(file)
-
-
-@functools.cache
-def cases(name: str) -> Case:
+def cases(name):
     """All cases of a family; too many agents or lines raise here."""
     return build_cases(load_family(name), range(CASES))
 
 
-def box(x: float, y: float, heading: float, length: float, width: float) -> Any:
-    """An oriented rectangle, built by shapely."""
-    flat = shapely.box(-length / 2, -width / 2, length / 2, width / 2)
-    turned = shapely.affinity.rotate(flat, heading, origin=(0, 0), use_radians=True)
-    return shapely.affinity.translate(turned, x, y)
-
-
-def test_the_catalogue_lists_all_files() -> None:
+def test_the_catalogue_lists_all_files():
     assert len(NAMES) >= 23
     assert sorted(family_names()) == NAMES
-    assert sum(text(name)["cases"] for name in NAMES) >= 3420
+    assert sum(tomllib.loads(file.read_text())["cases"] for file in FILES) >= 3420
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_road_is_sane(name: str) -> None:
+def test_the_road_is_sane(name):
     road = cases(name).road
     assert road.speed_limit.min() >= 3.0
     assert road.speed_limit.max() <= 40.0
@@ -73,7 +52,7 @@ def test_the_road_is_sane(name: str) -> None:
     assert (cases(name).ego_v <= 1.001 * road.speed_limit[:, 0]).all()
 
 
-def test_posted_bend_speeds_respect_their_advice() -> None:
+def test_posted_bend_speeds_respect_their_advice():
     """Where curve_speed posts a lower limit, v^2 |kappa| <= 3 m/s^2."""
     road = cases("curve_speed").road
     posted = road.speed_limit < 0.999 * road.speed_limit[:, :1]
@@ -85,15 +64,15 @@ def test_posted_bend_speeds_respect_their_advice() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_who_appears_at_the_start_or_beside_the_ego_leaves_room(name: str) -> None:
+def test_who_appears_at_the_start_or_beside_the_ego_leaves_room(name):
     batch, agents = cases(name), cases(name).agents
     used = agents.kind != Kind.NONE
     here = used & (agents.appear_s <= 0) & (agents.appear_t <= 0)
     for b, a in np.argwhere(here & (np.abs(agents.s) < 20.0)):
         length, width = float(batch.ego_length[b]), float(batch.ego_width[b])
-        ego = box(0.0, float(batch.road.path_l[b, 0]), 0.0, length, width)
+        ego = polygon(0.0, float(batch.road.path_l[b, 0]), 0.0, length, width)
         place = (agents.s, agents.l, agents.heading, agents.length, agents.width)
-        other = box(*(float(field[b, a]) for field in place))
+        other = polygon(*(float(field[b, a]) for field in place))
         assert ego.distance(other) > 0.3, (b, a)
     stations = np.arange(NUM_ROAD) * ROAD_STEP_M
     for b, a in np.argwhere(used & agents.relative & (np.abs(agents.s) <= 6.0)):
@@ -103,7 +82,7 @@ def test_who_appears_at_the_start_or_beside_the_ego_leaves_room(name: str) -> No
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_agents_move_as_their_kind_does(name: str) -> None:
+def test_agents_move_as_their_kind_does(name):
     agents = cases(name).agents
     used = agents.kind != Kind.NONE
     assert used.sum(axis=1).max() <= NUM_AGENTS
@@ -135,7 +114,7 @@ def test_agents_move_as_their_kind_does(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_first_event_is_within_the_drive(name: str) -> None:
+def test_the_first_event_is_within_the_drive(name):
     """120 s at the posted speed reach something to deal with."""
     batch = cases(name)
     reach = 120.0 * batch.road.speed_limit.mean(axis=1)
