@@ -1,4 +1,4 @@
-"""Short drives of hand-made cases; one compiled program per policy and length."""
+"""Short drives of hand-made cases; one compiled program per policy."""
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +18,9 @@ def stack(cases):
 
 
 def drive(cases, steps=300, policy=constant, params=0.0, **config):
-    """(record, snapshot) with numpy leaves [B, S, ...]."""
+    """(record, snapshot), numpy leaves [B, S, ...]; up to 4 cases have one shape."""
     config = RolloutConfig(steps=steps, **config)
     params = jnp.asarray(params) if isinstance(params, float) else params
-    record, shot, _ = drive_cases(policy, params, stack(cases), config)
-    return jax.tree.map(np.asarray, record), jax.tree.map(np.asarray, shot)
+    filled = [*cases, *[cases[-1]] * (-len(cases) % 4)]
+    record, shot, _ = drive_cases(policy, params, stack(filled), config)
+    return jax.tree.map(lambda x: np.asarray(x)[: len(cases)], (record, shot))

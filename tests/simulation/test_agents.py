@@ -21,19 +21,44 @@ def leader(speed, **more):
     return {"s": FAR, "v": speed, "phases": [(0.0, speed, 2.0)], **more}
 
 
-def test_idm_settles_at_the_equilibrium_gap():
-    """s_e = (s0 + v T) / sqrt(1 - (v / v0)^4), Treiber et al. 2000."""
-    settings = [(8.0, 1.0, 2.0, 15.0), (12.0, 1.5, 3.0, 20.0), (4.0, 2.0, 1.0, 14.0)]
-    cases = [
-        make_case([leader(v), follower(t, s0, v0)], speed=0.0)
-        for v, t, s0, v0 in settings
-    ]
-    _, shot = drive(cases, steps=1200)
-    for i, (v, t, s0, v0) in enumerate(settings):
-        gap = shot.agents.s[i, -1, 0] - shot.agents.s[i, -1, 1] - 4.6
-        expected = (s0 + v * t) / np.sqrt(1.0 - (v / v0) ** 4)
-        assert gap == pytest.approx(expected, rel=0.01)
-        assert shot.agents.v[i, -1, 1] == pytest.approx(v, abs=0.02)
+# IDM parameters of a follower, its start, and the leader's phases
+# (start s, speed m/s, rate m/s^2)
+PAIRS = (
+    {"headway": 1.0, "standstill": 1.0, "acceleration": 2.5, "braking": 3.0,
+     "desired": 20.0, "v": 8.0, "gap": 12.0, "lead": 8.0,
+     "phases": [(0.0, 16.0, 2.0), (12.0, 9.0, 3.0)]},
+    {"headway": 2.0, "standstill": 4.0, "acceleration": 0.8, "braking": 1.2,
+     "desired": 30.0, "v": 22.0, "gap": 70.0, "lead": 20.0,
+     "phases": [(0.0, 20.0, 1.0), (5.0, 14.0, 1.0), (20.0, 22.0, 0.8)]},
+    {"headway": 1.2, "standstill": 2.5, "acceleration": 1.8, "braking": 2.5,
+     "desired": 13.0, "v": 13.0, "gap": 30.0, "lead": 11.0,
+     "phases": [(0.0, 11.0, 2.0), (4.0, 0.0, 2.5), (16.0, 9.0, 1.5)]},
+)  # fmt: skip
+
+
+def test_a_follower_drives_as_the_idm_in_float64():
+    """The ballistic update of Treiber et al. 2000, behind the same leader."""
+    names = ("headway", "standstill", "acceleration", "braking", "desired", "v")
+    cases = []
+    for pair in PAIRS:
+        ahead = {"s": FAR, "v": pair["lead"], "phases": pair["phases"], "desired": 60.0}
+        behind = {"s": FAR - pair["gap"] - 4.6} | {name: pair[name] for name in names}
+        cases.append(make_case([{**ahead, "reacts": False}, behind], speed=0.0))
+    _, shot = drive(cases, steps=300)
+    for i, pair in enumerate(PAIRS):
+        t, s0, a, b, desired, v = (pair[name] for name in names)
+        lead_s, lead_v = np.r_[FAR, shot.agents.s[i, :, 0]], shot.agents.v[i, :, 0]
+        s, made = FAR - pair["gap"] - 4.6, []
+        for there, speed in zip(lead_s, np.r_[pair["lead"], lead_v], strict=True):
+            made.append((s, v))
+            wanted = s0 + max(v * t + v * (v - speed) / (2.0 * np.sqrt(a * b)), 0.0)
+            idm = a * (1.0 - (v / desired) ** 4 - (wanted / (there - s - 4.6)) ** 2)
+            after = max(v + 0.1 * max(idm, -MAX_BRAKING_MPS2), 0.0)
+            s, v = s + 0.05 * (v + after), after
+        s, v = np.array(made[1:]).T
+        assert np.ptp(v) > 3.0  # there is something to compare
+        np.testing.assert_allclose(shot.agents.v[i, :, 1], v, atol=0.02, rtol=0.0)
+        np.testing.assert_allclose(shot.agents.s[i, :, 1], s, atol=0.05, rtol=0.0)
 
 
 def test_braking_is_capped_and_delayed():

@@ -35,22 +35,26 @@ def at(agent, ego_v=10.0, ego_l=0.0, heading=0.0, kappa=0.0, lanes=(1, 1)):
     return jax.tree.map(lambda x: x[0], found), float(off)
 
 
-def test_fault_follows_nuplans_types():
-    behind = {"s": -4.6, "v": 15.0}
-    beside = {"s": -0.5, "l": 1.9, "v": 10.0}
-    cases = [
-        ({"s": 4.6, "v": 5.0}, 10.0, 0.0, True),  # into the car ahead
-        (behind, 10.0, 0.0, False),  # hit from behind
-        (behind, 0.0, 0.0, False),  # a standing ego is never at fault
-        ({"s": 4.6, "v": 0.0}, 0.0, 0.0, False),
-        (beside, 10.0, 0.0, False),  # side contact inside the own lane
-        (beside, 10.0, 1.0, True),  # side contact while straddling lanes
-        ({"s": 4.6, "v": 0.0, "kind": Kind.STATIC}, 10.0, 0.0, True),
-    ]
-    for agent, v, l, fault in cases:
-        found, _ = at(agent, ego_v=v, ego_l=l)
-        assert bool(found.hit), agent
-        assert bool(found.at_fault) is fault, agent
+AHEAD, BEHIND = {"s": 4.6, "v": 0.0}, {"s": -4.6, "v": 15.0}
+BESIDE = {"s": -0.5, "l": 1.9, "v": 10.0}
+
+
+@pytest.mark.parametrize(
+    ("agent", "v", "l", "fault"),
+    [
+        ({**AHEAD, "v": 5.0}, 10.0, 0.0, True),  # into the car ahead
+        ({**AHEAD, "kind": Kind.STATIC}, 10.0, 0.0, True),
+        (BEHIND, 10.0, 0.0, False),  # hit from behind
+        (BEHIND, 0.0, 0.0, False),  # a standing ego is never at fault
+        (AHEAD, 0.0, 0.0, False),
+        (BESIDE, 10.0, 0.0, False),  # side contact inside the own lane
+        (BESIDE, 10.0, 1.0, True),  # side contact while straddling lanes
+    ],
+)
+def test_fault_follows_nuplans_types(agent, v, l, fault):
+    found, _ = at(agent, ego_v=v, ego_l=l)
+    assert bool(found.hit)
+    assert bool(found.at_fault) is fault
 
 
 def polygon(x, y, angle, length, width):

@@ -17,12 +17,11 @@ from rcirl_jax.reward.speed_dp import SPEED_DP_ROW
 from rcirl_jax.simulation.cases import EgoState
 from rcirl_jax.simulation.rollout import first_scenes
 from rcirl_jax.simulation.rows import baseline_row
-from rcirl_jax.simulation.world import Vehicle, drive, lane_centre
+from rcirl_jax.simulation.world import Vehicle, lane_centre
 from rcirl_jax.simulators.drive import refuse_paths
 from rcirl_jax.units import STATION_STEP_M
 from tests.helpers.own_planner import drawn_reward
-from tests.simulation.drives import drive as drive_all
-from tests.simulation.drives import stack
+from tests.simulation.drives import drive, stack
 from tests.simulation.worlds import make_case
 
 PATHS = RankConfig(sampler=ONLINE_PATHS, safety=SafetyConfig(entry=True))
@@ -45,7 +44,7 @@ def driven():
     parked = {**SLOW, "l": 3.5, "v": 0.0, "phases": [(0.0, 0.0, 1.0)]}
     cases = [road(), road(lanes=(0, 0)), road([fast]), road([parked], lanes=(1, 1)),
              closed_left(road())]  # fmt: skip
-    record, shot = drive_all(cases, 250, policy=ROW.policy, params=ROW.params)
+    record, shot = drive(cases, 250, policy=ROW.policy, params=ROW.params)
     assert record.at_fault.sum() == 0
     return record, shot
 
@@ -75,17 +74,6 @@ def test_the_plan_is_what_is_driven_inside_the_limits_of_the_steering(driven):
     np.testing.assert_allclose(shot.plan_l[:, 1:, 0], record.l[:, :-1], atol=0.15)
     assert np.abs(record.curvature).max() <= Vehicle().max_curvature
     assert np.abs(record.v**2 * record.curvature).max() < 4.0
-
-
-def test_a_planned_path_is_reached_and_followed():
-    case = jax.tree.map(jnp.asarray, make_case(kappa=0.01, lanes=(1, 0)).road)
-    f = jnp.float32
-    ego = EgoState(s=f(0), l=f(0), heading=f(0), v=f(10), a=f(0), curvature=f(0))
-    planned = jnp.zeros((3, 2)).at[0].set(1.5)
-    step = lambda x, _: (drive(x, case, f(0), Vehicle(), planned),) * 2  # noqa: E731
-    _, log = jax.jit(lambda x: jax.lax.scan(step, x, length=100))(ego)
-    assert float(log.l[-1]) == pytest.approx(1.5, abs=0.02)
-    assert float(log.curvature[-1]) == pytest.approx(0.01 / (1 - 0.015), rel=0.02)
 
 
 def test_offsets_are_from_the_lane_that_goes_on():

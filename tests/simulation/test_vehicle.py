@@ -36,12 +36,6 @@ def run(state, road, command, steps, vehicle=PLAIN):
     return jax.jit(lambda x: jax.lax.scan(step, x, commands)[1])(state)
 
 
-def test_acceleration_follows_the_exact_first_order_lag():
-    log = run(ego(), road_of(), 2.0, 20)
-    t = 0.1 * np.arange(1, 21)
-    np.testing.assert_allclose(log.a, 2.0 * (1.0 - np.exp(-t / 0.2)), rtol=1e-4)
-
-
 def test_speed_never_turns_negative_and_the_car_then_stands():
     log = run(ego(v=4.0), road_of(), -6.0, 60)
     assert float(log.v.min()) == 0.0
