@@ -4,19 +4,18 @@ import dataclasses
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.export import save
 from rcirl_jax.export.loading import reward_params
 from rcirl_jax.export.own_planner import features as plain
+from rcirl_jax.export.own_planner.builder import plain_scene
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.planner.rank import learned_score
 from rcirl_jax.planner.safety import check, choose
 from rcirl_jax.sampling.kinematics import trajectory_from_positions, trajectory_on_path
-from rcirl_jax.types import Candidates
+from rcirl_jax.sampling.sampler import as_candidates
 from rcirl_jax.units import TIMES_S
-from tests.helpers.weights_files import columns_of, example_weights, loop_value
+from tests.helpers.weights_files import columns_of, example_weights, saved
 
 TOLERANCE = 1e-5  # of max(1, |x|)
 
@@ -68,22 +67,22 @@ def drawn_reward(
         scene_gating=gates,
     )
     x = rng.uniform(lower, upper, (3, TIMES_S.size, size)).astype(np.float32)
-    valid = np.ones(x.shape[:2], bool)
-    values = [loop_value(made, *one) for one in zip(x, valid, strict=True)]
-    return save(path, made, x, valid, np.array(values))
+    return saved(path, made, x)
 
 
 def candidates(scene, s, l):
     """The Candidates of one scene from [K, T] positions; l None: on the path."""
     if l is None:
-        motion = jax.vmap(trajectory_on_path, (None, 0))(scene, s)
-    else:
-        motion = jax.vmap(trajectory_from_positions, (None, 0, 0))(scene, s, l)
-    return Candidates(
-        trajectory=motion,
-        feasible=jnp.ones(s.shape[0], bool),
-        family=jnp.zeros(s.shape[0], jnp.int32),
-    )
+        return as_candidates(jax.vmap(trajectory_on_path, (None, 0))(scene, s))
+    make = jax.vmap(trajectory_from_positions, (None, 0, 0))
+    return as_candidates(make(scene, s, l))
+
+
+def plain_cases(scenes, s, l=None):
+    """Cases (plain scene, s, l) of scenes [n] and positions [n, K, T]."""
+    ones = [jax.tree.map(lambda x, n=n: x[n], scenes) for n in range(len(s))]
+    offsets = [None] * len(s) if l is None else l
+    return [(plain_scene(x), *at) for x, *at in zip(ones, s, offsets, strict=True)]
 
 
 @functools.cache

@@ -9,12 +9,7 @@ import numpy as np
 
 from rcirl_jax.export import PriorCost, Reward, pack, reader, save
 from rcirl_jax.features import feature_map
-from rcirl_jax.reward import (
-    RewardConfig,
-    RewardModel,
-    effective_params,
-    init_params,
-)
+from rcirl_jax.reward import RewardConfig, RewardModel, effective_params, init_params
 from rcirl_jax.reward import value as trained_value
 from rcirl_jax.reward.network import LEAKY_SLOPE, layers_of
 from rcirl_jax.reward.normaliser import Normaliser
@@ -114,6 +109,13 @@ def loop_value(weights, features, valid):
     return total
 
 
+def saved(path, weights, features):
+    """The reward of a file of weights, with the values of these features in it."""
+    valid = np.ones(features.shape[:2], bool)
+    values = [loop_value(weights, *one) for one in zip(features, valid, strict=True)]
+    return save(path, weights, features, valid, np.array(values))
+
+
 SPECS = feature_map("paper21").specs
 LOWER = np.array([spec.lower for spec in SPECS], np.float32)
 UPPER = np.array([spec.upper for spec in SPECS], np.float32)
@@ -145,9 +147,7 @@ def random_weights(path, draw=2, **provenance):
     )
     shape = (3, TIMES_S.size, len(SPECS))
     x = np.random.default_rng(draw).normal(size=shape).astype(np.float32)
-    valid = np.ones(x.shape[:2], bool)
-    values = [loop_value(made, *one) for one in zip(x, valid, strict=True)]
-    save(path, made, x, valid, np.array(values))
+    saved(path, made, x)
     return path
 
 

@@ -2,12 +2,10 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 
 from rcirl_jax.export import Guard, load_weights
-from rcirl_jax.export.own_planner.builder import plain_scene
 from rcirl_jax.export.own_planner.choose import choose
 from rcirl_jax.export.own_planner.features import (
     TIMES_S,
@@ -71,7 +69,8 @@ def likes_speed():
     return dataclasses.replace(reward, kernels=(fastest,), biases=(last,), gamma=T)
 
 
-def test_the_best_value_is_not_chosen_if_it_hits_the_leader(likes_speed):
+def test_the_best_value_that_is_admissible_is_chosen(likes_speed):
+    """Behind a leader that brakes, before a line, and where none is admissible."""
     found = choose(likes_speed, road(braking_leader()), holding())
     assert np.argmax(found.values) == 9
     assert found.why[9].startswith("hits obstacles[0] after ")
@@ -79,24 +78,14 @@ def test_the_best_value_is_not_chosen_if_it_hits_the_leader(likes_speed):
     assert found.best < 9
     assert found.none == ""
     np.testing.assert_array_equal(found.admissible, [not x for x in found.why])
-
-
-def test_the_best_value_is_not_chosen_if_it_runs_the_line(likes_speed):
     found = choose(likes_speed, road(stop_line()), holding())
     assert found.why[9].startswith("passes the line obstacles[0] at ")
     assert found.best == 0  # 4 m/s for 8 s ends before it
-
-
-def test_none_is_best_if_none_is_admissible(likes_speed):
-    standing = box(Kind.STATIC, 12.0 * T)
-    found = choose(likes_speed, road(standing), holding())
+    found = choose(likes_speed, road(box(Kind.STATIC, 12.0 * T)), holding())
     assert found.best is None
-    assert found.none.startswith(
-        "none of 10 candidates is admissible: candidate 0 hits"
-    )
+    assert found.none.startswith("none of 10 candidates is admissible: candidate 0 hit")
     nothing = choose(likes_speed, road(), np.zeros((0, 18)))
-    assert nothing.best is None
-    assert nothing.none == "none of 0 candidates is admissible"
+    assert (nothing.best, nothing.none) == (None, "none of 0 candidates is admissible")
 
 
 EDGES = {"road_left": FLAT + 6.0, "road_right": FLAT - 6.0}
@@ -137,16 +126,13 @@ def test_a_prior_cost_needs_own_values(rewards):
     found = choose(reward, road(), s, own=own)
     columns = FeatureMap(reward.names, reward.units)(road(), s)
     np.testing.assert_array_equal(found.values, reward.total(columns, own))
-    with pytest.raises(
-        FeatureError, match="own: None: expected own values, for it has"
+    for given, line in (
+        ({}, "own: None: expected own values, for it has"),
+        ({"own": own, "guard": Guard(reward)}, "guard: given: expected none, for it"),
+        ({"own": own[1:]}, r"own: shape \(9,\): expected 10 finite num"),
     ):
-        choose(reward, road(), s)
-    with pytest.raises(FeatureError, match="guard: given: expected none, for it has a"):
-        choose(reward, road(), s, own=own, guard=Guard(reward))
-    with pytest.raises(
-        FeatureError, match=r"own: shape \(9,\): expected 10 finite num"
-    ):
-        choose(reward, road(), s, own=own[1:])
+        with pytest.raises(FeatureError, match=line):
+            choose(reward, road(), s, **given)
 
 
 def test_own_values_choose_out_of_distribution(rewards):
@@ -176,14 +162,9 @@ def in_cpp(reader, folder, reward, cases, own=None, guard=False):
     lines = iter(run(reader, *words).decode().splitlines())
     for _, s, _ in cases:
         best, none = next(lines).split(" ", 1)
-        rows = [next(lines).split(" ", 1) for _ in s]
-        found = np.array([float(value) for value, _ in rows], np.float32)
-        yield (
-            None if int(best) == len(s) else int(best),
-            none,
-            found,
-            [x[1] for x in rows],
-        )
+        values, why = zip(*(next(lines).split(" ", 1) for _ in s), strict=True)
+        best = None if int(best) == len(s) else int(best)
+        yield best, none, np.array(values, np.float32), list(why)
 
 
 @pytest.mark.parametrize("name", ["speed", "prior", "guarded", "no_own"])
@@ -194,10 +175,7 @@ def test_choices_in_cpp_are_those_of_python(reader, rewards, tmp_path, name):
     s, l = drawn_scenes.candidates(np.random.default_rng(8), scenes, EACH)
     own = np.random.default_rng(7).normal(scale=3.0, size=(SCENES, EACH))
     own = None if name in ("speed", "lateral", "no_own") else own.astype(np.float32)
-    cases = []
-    for n in range(SCENES):
-        plain = plain_scene(jax.tree.map(lambda x, n=n: x[n], scenes))
-        cases.append((plain, s[n], None if name == "speed" else l[n]))
+    cases = own_planner.plain_cases(scenes, s, None if name == "speed" else l)
     told, equal, known = in_cpp(reader, tmp_path, reward, cases, own, guard), 0, set()
     for n, (best, none, values, why) in enumerate(told):
         options = {"own": None if own is None else own[n]}

@@ -35,6 +35,7 @@ def cases():
     return {case.name: case for case in check.read_cases(check.CASES)}
 
 
+@pytest.fixture(scope="module")
 def scenes():
     return dict(make.cases())
 
@@ -50,35 +51,25 @@ def positions(case):
     return s, l if len(l) else None
 
 
-def test_the_cases_hold_the_scenes_of_the_package(cases):
-    assert list(cases) == list(scenes())
-    for name, made in scenes().items():
-        ways = positions(cases[name])
-        text = [make.line(*x) for x in entries(plain_scene(made), *ways)]
-        assert cases[name].given.splitlines() == [*text, "end"]
-
-
-def test_the_answers_are_those_of_the_numpy_file(cases):
-    """Which is compared with JAX in test_features.py."""
-    for name, made in scenes().items():
-        case = cases[name]
+def test_the_cases_are_scenes_answers_and_rulings_of_the_numpy_files(cases, scenes):
+    """Which are compared with JAX in test_features.py and test_safety.py."""
+    assert list(cases) == list(scenes)
+    for name, made in scenes.items():
+        case, plain = cases[name], plain_scene(made)
+        s, l = positions(case)
+        text = [make.line(*x) for x in entries(plain, s, l)]
+        assert case.given.splitlines() == [*text, "end"]
         reward = load_weights(ONBOARD / "conformance" / case.weights)
         assert case.columns == list(reward.names)
-        found, values = numpy_answers(reward, plain_scene(made), *positions(case))
+        found, values = numpy_answers(reward, plain, s, l)
         wanted = np.array(case.rows).reshape(found.shape)
-        valid = case.valid
-        assert error(found[:, :valid], wanted[:, :valid]) <= TOLERANCE
+        assert error(found[:, : case.valid], wanted[:, : case.valid]) <= TOLERANCE
         assert error(values, np.array(case.scores)) <= TOLERANCE
-
-
-def test_the_rulings_are_those_of_the_numpy_file(cases):
-    for name, made in scenes().items():
-        s, l = positions(cases[name])
         safety = SafetyConfig(entry=l is not None)
-        reason, obstacle, time = admit(plain_scene(made), s, l, safety=safety)
+        reason, obstacle, time = admit(plain, s, l, safety=safety)
         time = np.where(np.isfinite(time), time, -1.0)
-        found = np.stack([reason, obstacle, time], axis=1).ravel()
-        np.testing.assert_allclose(found, cases[name].rulings, rtol=1e-6, err_msg=name)
+        rulings = np.stack([reason, obstacle, time], axis=1).ravel()
+        np.testing.assert_allclose(rulings, case.rulings, rtol=1e-6, err_msg=name)
 
 
 def test_the_filter_is_compared_if_asked_for(cases, tmp_path):
@@ -115,24 +106,18 @@ def checked(*command):
 
 # a file of F for planners, what stands there, the mistake instead, and the columns of
 # the case "follow" that are wrong then
-FAULTS = {
-    "none": (features, "", "", ()),
-    "sign_of_relative_speed": (
-        f,
-        "xp.where(unknown, 0.0, speed - v)",
-        "xp.where(unknown, 0.0, v - speed)",
-        ("follow_speed",),
-    ),
-}
+# a text of the columns' file, and the mistake instead
+RIGHT = "xp.where(unknown, 0.0, speed - v)"
+WRONG = "xp.where(unknown, 0.0, v - speed)"
 
 
-def numpy_files(module, old, new, folder, monkeypatch):
-    """The three files as a planner copies them, with one text of one replaced."""
+def numpy_files(folder, monkeypatch):
+    """The three files as a planner copies them, with the mistake."""
     for file in (f, features, units):
         text = Path(file.__file__).read_text()
-        if file is module and old:
-            assert text.count(old) == 1
-            text = text.replace(old, new)
+        if file is f:
+            assert text.count(RIGHT) == 1
+            text = text.replace(RIGHT, WRONG)
         (folder / Path(file.__file__).name).write_text(text)
     monkeypatch.syspath_prepend(folder)
     monkeypatch.setitem(sys.modules, "rcirl_jax.features", None)
@@ -141,23 +126,21 @@ def numpy_files(module, old, new, folder, monkeypatch):
     return importlib.import_module("features")
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_planted_faults_are_found(cases, tmp_path, monkeypatch, fault):
-    *planted, columns = FAULTS[fault]
-    given = scenes()
-    module = numpy_files(*planted, tmp_path, monkeypatch)
+def test_planted_faults_are_found(cases, scenes, tmp_path, monkeypatch):
+    """A wrong sign of the relative speed, and nothing else, is named."""
+    module = numpy_files(tmp_path, monkeypatch)
 
     def of_the_module(name, _):
         reward = load_weights(ONBOARD / "conformance" / cases[name].weights)
-        scene, ways = plain_scene(given[name]), positions(cases[name])
+        scene, ways = plain_scene(scenes[name]), positions(cases[name])
         found = module.FeatureMap(reward.names, reward.units)(scene, *ways)
         values = reward.value(found, scene.time_valid)
         return [*found.ravel().tolist(), *values.tolist()]
 
     status, _, lines = checked(*answers(cases, tmp_path, of_the_module))
-    assert status == int(fault != "none")
+    assert status == 1
     named = [line.split(": ") for line in lines if line.startswith("follow: features")]
-    assert {place.split(", ")[-1] for _, _, place, *_ in named} == set(columns)
+    assert {place.split(", ")[-1] for _, _, place, *_ in named} == {"follow_speed"}
 
 
 def test_programs_that_fail_are_named():

@@ -110,38 +110,33 @@ def test_choose_adds_a_reward_with_a_prior_cost_to_the_costs(tmp_path):
     weights, features, *_ = golden()
     features = features.astype("<f4")
     costs = np.linspace(2.0, -3.0, len(features), dtype="<f4")
-    (tmp_path / "costs.f32").write_bytes(costs.tobytes())
-    (tmp_path / "few.f32").write_bytes(costs[1:].tobytes())
-    may = np.ones(len(features), np.uint8)
-    (tmp_path / "all").write_bytes(may.tobytes())
-
-    def said(*arguments):
-        command = [choose, *arguments]
-        return subprocess.run(
-            command, input=features.tobytes(), capture_output=True, check=False
-        )
-
     total = load_weights(weights).total(features, -costs)
     best = int(np.argmax(total))
-    may[best] = 0
-    (tmp_path / "others").write_bytes(may.tobytes())
+    may = np.arange(len(features)) != best
     second = int(np.argmax(np.where(may, total, -np.inf)))
-    done = said(weights, tmp_path / "others", tmp_path / "costs.f32")
+    (tmp_path / "costs.f32").write_bytes(costs.tobytes())
+    (tmp_path / "few.f32").write_bytes(costs[1:].tobytes())
+    (tmp_path / "all").write_bytes(b"\1" * len(features))
+    (tmp_path / "others").write_bytes(may.tobytes())
+
+    def said(file, *names):
+        words = [choose, file, *(tmp_path / name for name in names)]
+        return subprocess.run(words, input=features.tobytes(), capture_output=True)
+
+    done = said(weights, "others", "costs.f32")
     assert done.stdout.decode().startswith(f"candidate {second} of "), done.stderr
-    done = said(weights, tmp_path / "all", tmp_path / "costs.f32")
+    done = said(weights, "all", "costs.f32")
     start = f"candidate {best} of {len(total)}, value "
     assert done.stdout.decode().startswith(start), done.stderr
     value = float(done.stdout.decode().removeprefix(start).split(",")[0])
     assert value == pytest.approx(total.max(), rel=1e-5)
-    alone = WEIGHTS[0]
-    for arguments, wanted in (
-        ((weights,), "expected WEIGHTS ADMISSIBLE [COSTS]"),
-        ((weights, tmp_path / "all"), "COSTS as a third argument"),
-        ((weights, tmp_path / "none", tmp_path / "costs.f32"), "admissible: 0 bytes"),
-        ((weights, tmp_path / "all", tmp_path / "few.f32"), f"expected {len(costs)}"),
-        ((weights, tmp_path / "all", tmp_path / "none.f32"), "costs: 0 numbers"),
-        ((alone, tmp_path / "all", tmp_path / "costs.f32"), "expected no COSTS"),
+    for file, names, wanted in (
+        (weights, (), "expected WEIGHTS ADMISSIBLE [COSTS]"),
+        (weights, ("all",), "COSTS as a third argument"),
+        (weights, ("none", "costs.f32"), "admissible: 0 bytes"),
+        (weights, ("all", "few.f32"), f"expected {len(costs)}"),
+        (WEIGHTS[0], ("all", "costs.f32"), "expected no COSTS"),
     ):
-        done = said(*arguments)
+        done = said(file, *names)
         assert done.returncode == 2
         assert wanted in done.stderr.decode()

@@ -2,14 +2,12 @@
 
 import itertools
 
-import jax
 import numpy as np
 import pytest
 
 from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.scenes.collect import Collector, stack_scenes
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.export.own_planner.builder import plain_scene
 from tests.helpers import drawn_scenes
 from tests.helpers.own_planner import (
     TOLERANCE,
@@ -20,6 +18,7 @@ from tests.helpers.own_planner import (
     in_valid_times,
     jax_answers,
     numpy_answers,
+    plain_cases,
 )
 from tests.onboard.programs import built, run
 
@@ -62,9 +61,7 @@ def assert_equal(reader, given, folder, scenes, s, l):
     columns, reward = given
     expected, values = jax_answers(columns, reward, scenes, s, l)
     expected = in_valid_times(scenes, expected)
-    ones = [jax.tree.map(lambda x, i=i: x[i], scenes) for i in range(len(s))]
-    offsets = [None] * len(s) if l is None else l
-    cases = [(plain_scene(x), *at) for x, *at in zip(ones, s, offsets, strict=True)]
+    cases = plain_cases(scenes, s, l)
     for found in (
         [numpy_answers(reward, *case) for case in cases],
         list(cpp_answers(reader, reward, folder, cases)),
