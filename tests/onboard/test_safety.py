@@ -1,12 +1,9 @@
 """The safety filter for other people's planners, numpy and C++, against JAX."""
 
-import functools
-
 import jax
 import numpy as np
 import pytest
 
-from rcirl_jax.export.own_planner.builder import plain_scene
 from rcirl_jax.export.own_planner.choose import admit
 from rcirl_jax.export.own_planner.features import FeatureError
 from rcirl_jax.planner.safety import Reason, SafetyConfig, check, explain
@@ -35,15 +32,6 @@ def moved(by, entry):
     )
 
 
-@functools.cache
-def judge(config, on_path):
-    def of_one(scene, s, l):
-        given = own_planner.candidates(scene, s, None if on_path else l)
-        return check(scene, given, config).admissible, explain(scene, given, config)
-
-    return jax.jit(jax.vmap(of_one))
-
-
 def places(scenes, obstacle):
     """Places among the obstacles that a plain scene keeps."""
     kept = (scenes.obstacles.kind != 0) & scenes.obstacles.valid.any(axis=2)
@@ -60,38 +48,49 @@ def in_cpp(reader, folder, cases):
     return found.reshape(len(cases), -1, 3)
 
 
+def in_jax(scenes, s, l, config):
+    """Rulings [n, K, 3] of all scenes at once."""
+
+    def of_one(scene, s, l):
+        given = own_planner.candidates(scene, s, l)
+        return check(scene, given, config).admissible, explain(scene, given, config)
+
+    axes = (0, 0, None if l is None else 0)
+    admissible, found = jax.jit(jax.vmap(of_one, axes))(scenes, s, l)
+    reason, obstacle, time = (np.asarray(x) for x in found)
+    np.testing.assert_array_equal(reason == Reason.NONE, admissible)
+    time = np.where(np.isfinite(time), time, -1.0)
+    return np.stack([reason, places(scenes, obstacle), time], axis=2)
+
+
+def in_numpy(cases, config):
+    found = [np.stack(admit(*case, safety=config), axis=1) for case in cases]
+    return np.nan_to_num(np.stack(found), posinf=-1.0)
+
+
 @pytest.mark.parametrize("on_path", [True, False])
 def test_rulings_on_random_scenes_are_those_of_jax(reader, tmp_path, on_path):
     scenes = drawn_scenes.scenes(np.random.default_rng(5), SCENES)
     s, l = drawn_scenes.candidates(np.random.default_rng(6), scenes, EACH)
-    told, usual = [], SafetyConfig(entry=not on_path)
-    for config in (usual, *(moved(x, not on_path) for x in (-ROUNDING, ROUNDING))):
-        admissible, found = judge(config, on_path)(scenes, s, l)
-        reason, obstacle, time = (np.asarray(x) for x in found)
-        np.testing.assert_array_equal(reason == Reason.NONE, admissible)
-        time = np.where(np.isfinite(time), time, -1.0)
-        told.append(np.stack([reason, places(scenes, obstacle), time], axis=2))
-    wanted, looser, stricter = told
+    l, entry = None if on_path else l, not on_path
+    cases = own_planner.plain_cases(scenes, s, l)
+    usual = SafetyConfig(entry=entry)
+    looser, stricter = (in_numpy(cases, moved(x, entry)) for x in (-ROUNDING, ROUNDING))
     sure = (looser == stricter).all(axis=2)
     assert sure.mean() > 0.97
+    wanted = in_jax(scenes, s, l, usual)
     counts = np.bincount(wanted[..., 0].astype(int).ravel(), minlength=9)
     never = {Reason.NOT_FEASIBLE}
     never |= {Reason.ROAD, Reason.ENTRY} if on_path else set()
     assert all(counts[x] >= 5 for x in set(Reason) - never), counts
-    cases = []
-    for n in range(SCENES):
-        plain = plain_scene(jax.tree.map(lambda x, n=n: x[n], scenes))
-        cases.append((plain, s[n], None if on_path else l[n]))
-    in_numpy = np.stack([np.stack(admit(*x, safety=usual), axis=1) for x in cases])
-    in_numpy = np.where(np.isfinite(in_numpy), in_numpy, -1.0)
-    for rulings in (in_numpy, in_cpp(reader, tmp_path, cases)):
+    for rulings in (in_numpy(cases, usual), in_cpp(reader, tmp_path, cases)):
         np.testing.assert_allclose(rulings[sure], wanted[sure], rtol=1e-6)
 
 
 def test_what_the_vehicle_cannot_drive_is_the_first_reason():
     scenes = drawn_scenes.scenes(np.random.default_rng(5), 1)
     s, _ = drawn_scenes.candidates(np.random.default_rng(6), scenes, 2)
-    plain = plain_scene(jax.tree.map(lambda x: x[0], scenes))
+    ((plain, *_),) = own_planner.plain_cases(scenes, s)
     found = admit(plain, s[0], feasible=np.array([False, True]))
     assert found.reason[0] == Reason.NOT_FEASIBLE
     assert found.reason[1] != Reason.NOT_FEASIBLE
