@@ -3,13 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.planner.rank import ONLINE
-from rcirl_jax.sampling.sampler import speed_profiles
 from rcirl_jax.units import TIMES_S
-
-
-def copied(scene, key):
-    return speed_profiles(key, scene, ONLINE)
 
 
 def steady(scene, key, count=9):
