@@ -15,33 +15,23 @@ Tracked = enum.Enum(
 )
 
 
-@dataclasses.dataclass
-class StateSE2:
-    x: float
-    y: float
-    heading: float = 0.0
-
-
-@dataclasses.dataclass
-class StateVector2D:
-    x: float
-    y: float
-
-
-@dataclasses.dataclass
-class TimePoint:
-    time_us: int
+struct = dataclasses.make_dataclass
+StateSE2 = struct("StateSE2", ["x", "y", ("heading", float, 0.0)])
+StateVector2D = struct("StateVector2D", ["x", "y"])
+TimePoint = struct("TimePoint", ["time_us"])
+DetectionsTracks = struct("DetectionsTracks", ["tracked_objects"])
+InterpolatedTrajectory = struct("InterpolatedTrajectory", ["states"])
 
 
 @dataclasses.dataclass
 class EgoState:
     """The state of the centre; its box is 5.2 m by 2.3 m."""
 
-    center: StateSE2
-    center_velocity_2d: StateVector2D
-    center_acceleration_2d: StateVector2D
+    center: Any
+    center_velocity_2d: Any
+    center_acceleration_2d: Any
     tire_steering_angle: float
-    time_point: TimePoint
+    time_point: Any
     vehicle_parameters: Any = dataclasses.field(
         default_factory=lambda: SimpleNamespace(wheel_base=3.1)
     )
@@ -52,21 +42,12 @@ class EgoState:
 
     @property
     def dynamic_car_state(self):
-        return SimpleNamespace(
-            center_velocity_2d=self.center_velocity_2d,
-            center_acceleration_2d=self.center_acceleration_2d,
-        )
+        return self
 
     @property
     def car_footprint(self):
-        return SimpleNamespace(
-            length=5.2, width=2.3, vehicle_parameters=self.vehicle_parameters
-        )
-
-
-@dataclasses.dataclass
-class DetectionsTracks:
-    tracked_objects: Any
+        box, parameters = {"length": 5.2, "width": 2.3}, self.vehicle_parameters
+        return SimpleNamespace(**box, vehicle_parameters=parameters)
 
 
 class AbstractPlanner:
@@ -76,11 +57,6 @@ class AbstractPlanner:
 
     def compute_trajectory(self, current_input):
         return self.compute_planner_trajectory(current_input)
-
-
-@dataclasses.dataclass
-class InterpolatedTrajectory:
-    states: list
 
 
 class Lane:

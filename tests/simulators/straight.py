@@ -1,7 +1,9 @@
 """A simulator for tests: a straight road with one car ahead at a constant speed."""
 
+import numpy as np
+
 from rcirl_jax.export.own_planner.inputs import Body, Car, CentreLine, Signal
-from rcirl_jax.simulators.simulators import STEP_S, LockStep, View
+from rcirl_jax.simulators.simulators import STEP_S, LockStep, Move, View
 
 ROAD = CentreLine(points=[[-50.0, 0.0], [1500.0, 0.0]], speed_limit=15.0)
 
@@ -33,31 +35,19 @@ class StraightEpisode:
     def look(self):
         if self.x > 1200.0:
             return None
-        lead = Body(
-            x=40.0 + self.lead_speed * self.time,
-            y=0.0,
-            heading=0.0,
-            speed=self.lead_speed,
-            length=4.0,
-            width=1.8,
-        )
-        ego = Car(
-            x=self.x,
-            y=0.0,
-            heading=0.0,
-            speed=self.v,
-            acceleration=self.a,
-            length=5.0,
-            width=2.0,
-        )
+        ahead = 40.0 + self.lead_speed * self.time
+        moves = {"speed": self.v, "acceleration": self.a}
         return View(
-            ego=ego,
+            ego=Car(x=self.x, y=0.0, heading=0.0, length=5.0, width=2.0, **moves),
             centre_line=ROAD,
-            obstacles=[lead],
+            obstacles=[
+                Body(x=ahead, y=0.0, heading=0.0, speed=self.lead_speed,
+                     length=4.0, width=1.8)
+            ],
             signals=self.signals,
             way=self.x,
             speed_limit=15.0,
-        )
+        )  # fmt: skip
 
     def step(self, move):
         self.time += STEP_S
@@ -68,6 +58,13 @@ class StraightEpisode:
 
     def close(self):
         pass
+
+
+def moved(way, speed, acceleration=0.0, beside=None):
+    """A move whose plan nobody looks at."""
+    future = np.zeros((18, 3), np.float32)
+    a = acceleration
+    return Move(way=way, speed=speed, acceleration=a, future=future, beside=beside)
 
 
 def red_light(x):

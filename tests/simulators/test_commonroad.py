@@ -17,20 +17,18 @@ from rcirl_jax.export.own_planner.features import Ego, FeatureMap, Path, Scene
 from rcirl_jax.export.reader import load_weights
 from rcirl_jax.simulators.commonroad import BY_REWARD, DEFAULT, CommonRoad, Replay
 from rcirl_jax.simulators.commonroad_cost import RewardCost, obstacle
-from rcirl_jax.simulators.simulators import Move, open_simulator
+from rcirl_jax.simulators.simulators import open_simulator
 from rcirl_jax.units import TIMES_S
 from tests.data.formats import writers as w
 from tests.onboard.programs import ONBOARD
+from tests.simulators.straight import moved
 
 WEIGHTS = str(ONBOARD / "conformance" / "paper21.msgpack")
 OTHER = os.environ.get("RCIRL_COMMONROAD_PYTHON", "")
 needs_commonroad = pytest.mark.skipif(
     not OTHER, reason="RCIRL_COMMONROAD_PYTHON: an interpreter that has CommonRoad"
 )
-MOVE = Move(way=1.5, speed=15.0, acceleration=0.0, future=np.zeros((18, 3)))
-
-
-# --------------------------------------------------------------------- the cost
+MOVE = moved(1.5, 15.0)
 
 
 def road(boxes=()):
@@ -94,8 +92,6 @@ def test_a_known_future_is_a_box_along_the_road():
     np.testing.assert_allclose(box.speed, 0.0, atol=1e-6)
 
 
-# ----------------------------------------------------- episodes, by a stand-in worker
-
 STAND_IN = """
 import json, sys
 line = [[2.0 * i - 40.0, 0.0] for i in range(200)]
@@ -139,8 +135,8 @@ def test_the_ego_goes_along_the_line_and_its_offset_fades():
 
 def test_an_own_driver_is_shown_where_the_worker_has_it():
     episode = replay(driven=True)
-    episode.step(None)
-    episode.step(None)
+    for _ in range(2):
+        episode.step(None)
     view = episode.look()
     assert (view.ego.x, view.ego.y, view.ego.speed) == (2.8, 0.5, 14.0)
     assert (view.ego.acceleration, view.speed_limit) == (-1.0, 18.0)
@@ -182,16 +178,13 @@ def test_wrong_options_have_one_line(options, line):
         open_simulator("commonroad", **options)
 
 
-# -------------------------------------------------------- with CommonRoad's packages
-
-
-def scenario(folder, steps=30):
+def scenario(folder):
     """A lane of 400 m; the ego at 10 m/s behind a car that drives at 6 m/s."""
     lane = w.lanelet(
         left=[(x, 1.75) for x in range(-40, 361, 20)],
         right=[(x, -1.75) for x in range(-40, 361, 20)],
     ).replace("</lanelet>", "<laneletType>urban</laneletType></lanelet>")
-    ahead = [w.state(k, 25.0 + 0.6 * k, 0.0, speed=6.0) for k in range(1, steps)]
+    ahead = [w.state(k, 25.0 + 0.6 * k, 0.0, speed=6.0) for k in range(1, 30)]
     car = w.car(x0=25.0, states=ahead).replace(
         "<exact>15.0</exact>", "<exact>6.0</exact>"
     )
@@ -210,12 +203,12 @@ def scenario(folder, steps=30):
     )  # fmt: skip
 
 
-def driven(simulator, own, move=None):
+def driven(simulator, own):
     """The views of the one episode."""
     running, views = simulator.start(simulator.episodes(1, 0), own), []
     while (view := running.look()[0]) is not None:
         views.append(view)
-        running.step([move])
+        running.step([None])
     running.close()
     return views
 
@@ -236,14 +229,6 @@ def test_the_reactive_planner_drives_by_both_costs(tmp_path):
         ways[own] = views[-1].way
     assert min(ways.values()) > 10.0
     assert abs(ways[DEFAULT] - ways[BY_REWARD]) > 0.1
-
-
-@needs_commonroad
-def test_a_row_of_ours_goes_by_its_moves(tmp_path):
-    scenario(tmp_path, steps=20)
-    views = driven(CommonRoad(str(tmp_path), OTHER), None, MOVE)
-    assert len(views) == 20
-    assert views[-1].ego.x == pytest.approx(19 * 1.5, abs=1e-2)
 
 
 @needs_commonroad

@@ -77,10 +77,10 @@ def test_the_planner_follows_the_leader_without_a_crash(driven):
     assert logs[CREEPS]["v"][-1] == pytest.approx(5.0, abs=0.7)
 
 
-def test_episodes_do_not_depend_on_who_drives_beside_them():
-    alone = drive(Straight(), hand_set(), [CREEPS], 3.0)[CREEPS]
-    beside = drive(Straight(), hand_set(), [STANDS, CREEPS], 3.0)[CREEPS]
-    np.testing.assert_array_equal(alone["v"], beside["v"])
+def test_episodes_do_not_depend_on_who_drives_beside_them(driven):
+    alone = drive(Straight(), hand_set(), [CREEPS], 3.0)[CREEPS]["v"]
+    beside = driven["hand-set"][CREEPS]["v"]  # one of three
+    np.testing.assert_array_equal(alone, beside[: alone.size])
 
 
 def test_a_red_light_is_a_wall_and_its_distance_is_measured():

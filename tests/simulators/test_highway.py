@@ -8,14 +8,7 @@ highway = pytest.importorskip("rcirl_jax.simulators.highway")
 from highway_env.envs import MergeEnv  # noqa: E402
 
 from rcirl_jax.simulators.drive import Seen  # noqa: E402
-from rcirl_jax.simulators.simulators import Move  # noqa: E402
-
-
-def move(way, speed, acceleration=0.0, beside=None):
-    future = np.zeros((18, 3), np.float32)
-    return Move(
-        way=way, speed=speed, acceleration=acceleration, future=future, beside=beside
-    )
+from tests.simulators.straight import moved  # noqa: E402
 
 
 @pytest.fixture(params=["dense/3/0001", "merge/0/0002"])
@@ -61,7 +54,7 @@ def test_the_gap_ahead_is_that_of_the_simulators_own_search(episode):
 
 def test_a_move_puts_the_ego_where_it_says(episode):
     before = episode.look()
-    episode.step(move(2.5, 26.0, 1.0))
+    episode.step(moved(2.5, 26.0, 1.0))
     after = episode.look()
     assert after.way == 2.5
     assert after.ego.x - before.ego.x == pytest.approx(2.5, abs=1e-3)
@@ -86,7 +79,7 @@ def test_a_planned_path_leads_into_the_next_lane(episode):
     assert lane == 1
     for _ in range(20):
         offset -= 0.2
-        episode.step(move(2.0, 20.0, beside=(offset, -0.1, 0.001)))
+        episode.step(moved(2.0, 20.0, beside=(offset, -0.1, 0.001)))
         view = episode.look()
         asides.append(view.aside)
         offset -= view.aside
@@ -95,8 +88,8 @@ def test_a_planned_path_leads_into_the_next_lane(episode):
     assert [x for x in asides if x] == [-4.0]
     assert asides.index(-4.0) == 10  # behind the line between both
     assert offset == pytest.approx(0.0, abs=1e-9)
-    moved = np.array(episode.ego.position) - start
-    np.testing.assert_allclose(moved, [40.0, -4.0], atol=0.02)
+    driven = np.array(episode.ego.position) - start
+    np.testing.assert_allclose(driven, [40.0, -4.0], atol=0.02)
     assert episode.ego.lane_index[2] == 0
     assert view.way == pytest.approx(40.0)
     assert view.centre_line is not begins.centre_line

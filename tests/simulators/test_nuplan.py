@@ -6,10 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rcirl_jax.export import save
 from rcirl_jax.simulators.nuplan import reward_planner
 from rcirl_jax.units import TIMES_S
-from tests.helpers.weights_files import example_weights, loop_value, of_the_preset
+from tests.helpers.weights_files import example_weights, of_the_preset, saved
 from tests.simulators import nuplan_stand_in as theirs
 
 X, Y = 664000.0, 3997000.0  # m, UTM: float32 alone would be off by decimetres
@@ -42,8 +41,7 @@ def weights(tmp_path_factory):
         made, kernels=(liked,), biases=(np.zeros(1),), gamma=np.ones(TIMES_S.size)
     )
     path = tmp_path_factory.mktemp("weights") / "weights.msgpack"
-    x, valid = np.zeros((1, TIMES_S.size, 21), np.float32), np.ones((1, 18), bool)
-    save(path, made, x, valid, np.array([loop_value(made, x[0], valid[0])]))
+    saved(path, made, np.zeros((1, TIMES_S.size, 21), np.float32))
     return str(path)
 
 

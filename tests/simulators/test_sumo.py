@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 
 pytest.importorskip("libsumo")
@@ -10,19 +9,15 @@ pytest.importorskip("libsumo")
 import libsumo
 
 from rcirl_jax.simulators.drive import Seen
-from rcirl_jax.simulators.simulators import Move
 from rcirl_jax.simulators.sumo import KRAUSS, Sumo
+from tests.simulators.straight import moved
 
 NAMES = ["dense/0/0000", "single/0/0001", "sparse/0/0002"]
 
 
 def move(view, acceleration=0.0, beside=None):
     speed = max(view.ego.speed + 0.1 * acceleration, 0.0)
-    way = 0.05 * (view.ego.speed + speed)
-    future = np.zeros((18, 3), np.float32)
-    return Move(
-        way=way, speed=speed, acceleration=acceleration, future=future, beside=beside
-    )
+    return moved(0.05 * (view.ego.speed + speed), speed, acceleration, beside)
 
 
 @pytest.fixture(scope="module")
