@@ -263,8 +263,7 @@ class Record(flax.struct.PyTreeNode, kw_only=True):
     speed_limit: jax.Array  # [] m/s, posted, at the ego's station
     path_l: jax.Array  # [] m, given path at the ego's station
     clearance: jax.Array  # [] m to the nearest agent; < 0 while overlapping
-    ttc: jax.Array  # [] s, constant speeds and headings; inf if never
-    ttc_counts: jax.Array  # [] bool: nuPlan's TTC looks at that agent
+    ttc: jax.Array  # [] s to agents ahead at constant speeds and headings; inf if never
     headway: jax.Array  # [] s to the agent ahead in the own corridor; inf
     free_way: jax.Array  # [] m to that agent, or to a line that demands a stop; inf
     collision: jax.Array  # [] int32, number of agents hit in this step

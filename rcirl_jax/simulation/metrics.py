@@ -203,8 +203,7 @@ def case_metrics(record: Record, config: MetricsConfig) -> CaseMetrics:
     )
     (smooth_a, _, smooth_j), (smooth_across, _, smooth_j_lateral) = filtered[:2]
     yaw, yaw_a = filtered[2, 1], filtered[2, 2]
-    ttc = jnp.where(record.ttc_counts, record.ttc, jnp.inf)
-    below = jnp.maximum(config.ttc_threshold - ttc, 0.0)
+    below = jnp.maximum(config.ttc_threshold - record.ttc, 0.0)
     over = jnp.maximum(record.v - record.speed_limit, 0.0)
     second = round(1.0 / STEP_S)
     backward = jnp.pad(record.s[:-second] - record.s[second:], (second, 0))
@@ -226,7 +225,7 @@ def case_metrics(record: Record, config: MetricsConfig) -> CaseMetrics:
         jnp.abs(j_lateral) < config.max_jerk,
         jnp.abs(smooth_j) < config.max_jerk,
         jnp.abs(smooth_j_lateral) < config.max_jerk,
-        ttc > config.nuplan_ttc,
+        record.ttc > config.nuplan_ttc,
         gentle,
     ]
     slow = record.v < config.creeping_limit * record.speed_limit
@@ -268,7 +267,7 @@ def case_metrics(record: Record, config: MetricsConfig) -> CaseMetrics:
         "max_j_lateral": jnp.abs(j_lateral),
         "backward": backward,
         "min_a": -record.a,
-        "min_ttc": -ttc,
+        "min_ttc": -record.ttc,
         "min_headway": -record.headway,
         "min_clearance": -record.clearance,
     }

@@ -695,7 +695,6 @@ def _record(
 ) -> Record:
     road = case.road
     count = lambda mask: jnp.sum(mask, dtype=jnp.int32)  # noqa: E731
-    nearest = jnp.argmin(found.ttc)
     front = ego.s + 0.5 * case.ego_length
     fault = found.at_fault
     return Record(
@@ -710,7 +709,6 @@ def _record(
         path_l=lookup(road.path_l, ego.s, ROAD_STEP_M),
         clearance=jnp.min(found.clearance),
         ttc=jnp.min(jnp.where(found.ahead, found.ttc, jnp.inf)),
-        ttc_counts=found.ahead[nearest] & jnp.isfinite(found.ttc[nearest]),
         headway=headway(case, ego, state),
         free_way=jnp.minimum(
             gap_ahead(case, ego, state),

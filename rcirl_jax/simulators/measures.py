@@ -26,7 +26,7 @@ EpisodeLog = dict[str, np.ndarray]
 FAR = dict.fromkeys(("clearance", "ttc", "headway", "free_way"), math.inf)
 REST = {"speed_limit": 1.0, **FAR}
 COUNTS = ("collision", "at_fault", "at_fault_vru", "at_fault_object")  # int32
-MARKS = ("valid", "ttc_counts", "red_light", "stop_sign", "fallback")  # bool
+MARKS = ("valid", "red_light", "stop_sign", "fallback")  # bool
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -104,7 +104,6 @@ def sample(
         "curvature": view.ego.curvature,
         "speed_limit": view.speed_limit,
         "ttc": max(gap, 0.0) / max(v - gap_speed, 1e-3),
-        "ttc_counts": True,
         "headway": gap / v if v > 0.5 else math.inf,
         "free_way": min(gap, line),
         "collision": hit is not None,

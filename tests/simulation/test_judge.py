@@ -120,6 +120,13 @@ def test_time_to_collision_is_gap_over_closing_speed():
     assert np.isinf(float(at({"s": 90.0, "v": 4.0}, ego_v=14.0)[0].ttc))  # beyond 3 s
 
 
+def test_a_car_behind_hides_no_time_to_collision_ahead():
+    ahead, behind = {"s": 30.0, "v": 4.0}, {"s": -12.0, "v": 25.0}
+    cases = [make_case(x, speed=14.0) for x in ([ahead], [ahead, behind])]
+    alone, both = drive(cases)[0].ttc[:, 0]
+    assert both == alone < 2.6
+
+
 def test_off_road_is_the_farthest_corner():
     _, off = at({"s": 100.0}, ego_l=2.0, lanes=(0, 0))
     assert off == pytest.approx(2.0 + 1.055 - 2.25, abs=1e-3)

@@ -19,7 +19,7 @@ from rcirl_jax.simulation.metrics import (
 
 S = 100
 NEVER = ("ttc", "headway", "clearance", "free_way")
-FLAGS = ("ttc_counts", "red_light", "stop_sign", "fallback")
+FLAGS = ("red_light", "stop_sign", "fallback")
 COUNTS = ("collision", "at_fault", "at_fault_vru", "at_fault_object")
 MEASURE = jax.jit(lambda record: case_metrics(record, MetricsConfig()))
 
@@ -139,10 +139,9 @@ def test_samples_after_the_end_do_not_count():
     assert found.mean_speed == pytest.approx(10.0)
 
 
-def test_ttc_counts_only_where_nuplan_looks():
-    ttc = at(50, 0.5, np.inf)
-    assert measured(ttc=ttc).ttc_bound == 1.0
-    found = measured(ttc=ttc, ttc_counts=at(50, True, False, bool))
+def test_a_time_to_collision_below_the_bound_counts():
+    assert measured().ttc_bound == 1.0
+    found = measured(ttc=at(50, 0.5, np.inf))
     assert found.ttc_bound == 0.0
     assert found.tet == pytest.approx(0.1)
     assert found.tit == pytest.approx(0.1)

@@ -202,7 +202,7 @@ def test_safety_counts_what_happens_before_a_crash():
     shape, late = (2, 10), np.arange(10) >= 6
     record = types.SimpleNamespace(
         valid=np.stack([np.arange(10) < 8, ~late]), at_fault=np.zeros(shape),
-        ttc=np.full(shape, 0.5), ttc_counts=np.stack([late, late]),
+        ttc=np.where([late, late], 0.5, np.inf),
         headway=np.where([late, ~late], 0.5, np.inf), v=np.full(shape, 5.0),
         induced_braking=np.stack([5.0 * late, 3.0 + late]),
     )  # fmt: skip

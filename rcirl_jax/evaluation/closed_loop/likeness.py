@@ -393,7 +393,7 @@ def traffic_of(record: Record, lasts: np.ndarray) -> dict[str, np.ndarray]:
     valid = lasts & np.asarray(record.valid)
     happens = {
         "collision": record.at_fault > 0,
-        "ttc": record.ttc_counts & (record.ttc < MetricsConfig.nuplan_ttc),
+        "ttc": record.ttc < MetricsConfig.nuplan_ttc,
         "braking": record.induced_braking > BRAKING_MPS2,
     }
     close = (record.headway < HEADWAY_S) & (record.v > MOVING_MPS) & valid
