@@ -8,6 +8,7 @@ from pathlib import Path
 from rcirl_jax.data.formats import IMPORTERS, module_of
 from rcirl_jax.data.formats.files import is_input
 from rcirl_jax.data.formats.format import FORMATS
+from rcirl_jax.data.readers.tables.streams import refuse_pointer
 from rcirl_jax.data.readers.tables.table import open_table
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml, spec_root
@@ -45,10 +46,12 @@ def recognised_format(path: Path | None, source: Path | None = None) -> str:
             found.pop(weak, None)
     if len(found) == 1:
         return next(iter(found))
+    files = [path] if path.is_file() else [*_matching(path, TABLES)]
+    for file in (*found.values(), *files[:MAX_FILES]):
+        refuse_pointer(file)
     if found:
         each = ", ".join(f"{file.name} of {name}" for name, file in found.items())
         raise InputError(f"{path}: format: not given: expected one of them for {each}")
-    files = [path] if path.is_file() else _matching(path, TABLES)
     table = next((f for f in files if f.is_file() and any(map(f.match, TABLES))), None)
     if table is not None:
         tomls = path.glob("*.toml") if path.is_dir() else ()

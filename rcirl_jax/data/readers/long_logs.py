@@ -31,7 +31,7 @@ from rcirl_jax.data.readers.tables.rows import (
     Distance,
     Rows,
     RowStats,
-    after_midnight,
+    after_turn,
     drop_duplicates,
     drop_position_outliers,
     is_far,
@@ -113,7 +113,7 @@ def rows_of(
     stats: RowStats,
     *,
     is_long: bool,
-    is_clock: bool = False,
+    turn_s: float = DAY_S,
     **tidying: Any,  # noqa: ANN401
 ) -> Iterator["RowStore"]:
     """Gives the rows of a table, each road user once in a frame.
@@ -124,7 +124,7 @@ def rows_of(
       stats: of the file.
       is_long: the rows go to scratch files, which are removed afterwards; a bar
         shows the reading.
-      is_clock: t is a time of day, which may go over midnight.
+      turn_s: s after which a clock without a date begins anew, as at midnight.
       **tidying: places, may_differ, distance of `RowStore`.
 
     Raises:
@@ -140,7 +140,7 @@ def rows_of(
                 if not is_long:
                     check_rows(table, stats.read)
         stats.check()
-        made.finish(is_clock)
+        made.finish(turn_s)
         yield made
 
 
@@ -199,25 +199,26 @@ class RowStore:
         if self.folder is not None and self._held > BUFFER_BYTES:
             self._flush()
 
-    def finish(self, is_clock: bool) -> None:
+    def finish(self, turn_s: float) -> None:
         """Ends the adding; times of day after midnight become those of the next."""
         if self.folder is not None:
             self._flush()
-        t, days = self._names.index("t"), round(DAY_S / BLOCK_S)
-        for code, minutes in self._blocks.items() if is_clock else ():
+        t, later_by = self._names.index("t"), round(turn_s / BLOCK_S)
+        is_dated = min(self._seconds, default=0.0) >= turn_s
+        for code, minutes in () if is_dated else self._blocks.items():
             if self.folder is None:
                 rows = self._rows(code, 0)
-                rows[:, t] = after_midnight(rows[:, t])
+                rows[:, t] = after_turn(rows[:, t], turn_s)
                 self._put(code, 0, rows)
                 continue
             found = np.array(sorted(minutes), float)
-            later = after_midnight(found * BLOCK_S) > found * BLOCK_S
+            later = after_turn(found * BLOCK_S, turn_s) > found * BLOCK_S
             for minute in found[later].astype(int).tolist():
                 rows = self._rows(code, minute)
-                rows[:, t] += DAY_S
+                rows[:, t] += turn_s
                 self._file(code, minute).unlink()
                 del minutes[minute]
-                self._put(code, minute + days, rows)
+                self._put(code, minute + later_by, rows)
 
     def _file(self, code: int, minute: int) -> Path:
         assert self.folder is not None

@@ -22,7 +22,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.formats.csv.names import compass_axis, words_of
+from rcirl_jax.data.formats.csv.names import (
+    compass_axis,
+    every_word,
+    is_in_pixels,
+    words_of,
+)
 from rcirl_jax.data.formats.options import UNITS, number, one_of, positive, section
 from rcirl_jax.data.formats.projection import projected
 from rcirl_jax.data.readers.tables.cells import (
@@ -32,7 +37,7 @@ from rcirl_jax.data.readers.tables.cells import (
     day_and_second,
     times_of_day,
 )
-from rcirl_jax.data.readers.tables.rows import Rows
+from rcirl_jax.data.readers.tables.rows import DAY_S, Rows
 from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
     MAX_TIME,
@@ -63,27 +68,38 @@ OPTIONAL = tuple(field for field in (*NUMBERS, *TEXT) if field not in NEEDED)
 EXPECTED = (*NEEDED, "automated")  # errors where they are named and not there
 EARTH = {"lat": "y", "lon": "x"}  # names of x and y in degrees
 DEGREES = {"x": 360.0, "y": 90.0}  # longitude counts from -180 or from 0
-EARTH_WORDS = {
-    "x": {"lon", "lng", "long", "longitude", "längengrad", "laengengrad"},
-    "y": {"lat", "latitude", "breitengrad"},
-}
 DEGREE_M = 111_320.0  # m of a degree of latitude
 MIDDLE_DIGITS = 2  # of latitude and longitude of the projection's middle
 RATE_HZ = 10.0  # 1/s
-ISO_TIMES = r"\d{4}-\d\d-\d\d[T ]|\d{8}T\d|\d{4}/\d\d/\d\d |\d{1,2}:\d\d"  # as read
+# as read; not 07:15.2, which are minutes and seconds, nor 07:15:02.3 PM
+ISO_TIMES = r"\d{4}-\d\d-\d\d[T ]|\d{8}T\d|\d{4}/\d\d/\d\d |\d{1,2}:\d\d(?!\d*[.,]\d)(?!.*[AaPp]\.?[Mm])"
 # dates that are neither numbers nor ISO's; the day comes first where both orders fit
-DATES = ("%d.%m.%Y", "%d.%m.%y", "%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y")
+DATES = (
+    *("%d.%m.%Y", "%d.%m.%y", "%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y", "%d-%b-%Y"),
+    *("%Y%m%d", "%Y-%m-%d", "%Y.%m.%d"),
+)
+SEPARATORS = (" ", "-", "_", "T")  # of a date and a time
 TIMES_OF_DAY = (
     *("%H:%M:%S.%f", "%H:%M:%S,%f", "%H:%M:%S", "%I:%M:%S.%f %p", "%I:%M:%S %p"),
+    *("%H%M%S.%f", "%H%M%S", "%H-%M-%S.%f", "%H.%M.%S.%f"),
 )
+# without a date: of a day, as ISO does not write them, and of an hour
+CLOCK_PATTERNS = ("%I:%M:%S.%f %p", "%I:%M:%S %p", "%M:%S.%f", "%M:%S,%f")
 DATE = "%Y%m%d%H%M%S"
 # dates and times as digits alone: of 14, 17 or 20, which no clock of Unix has
 DATE_DIGITS = re.compile(
     r"(19|20)\d\d(0[1-9]|1[0-2])([0-2]\d|3[01])([01]\d|2[0-3])([0-5]\d){2}(\d{3}){0,2}"
 )
 CLOCK_FROM = 1e6  # HHMMSSmmm from 00:10 on; numbers below it are common counters
+HINTS = {
+    "t": "units.t of the source TOML says how times are written: s, ms, us, ns, ..., or "
+    'a pattern such as "%d.%m.%Y %H:%M:%S.%f"',
+    "earth": "degrees with decimals; south and west are negative",
+}  # of cells that cannot be read
+HOUR_S = 3600.0  # s
 HOLE_S = 40.0  # s that digits leave out at the end of a minute, 4040 of an hour
 AT_A_MINUTE_S = 2.0  # s at most between the last row of a minute and the next one
+OF_PIXELS = "places in pixels take metres per pixel in [scale], such as x = 0.1"
 UNCLEAR = "?"  # in a draft: a needed column that nobody knows
 HOLE = "{id}"  # in a column's name: which road user's it is
 # name -> sign and zero [rad]; north is +y
@@ -130,7 +146,7 @@ class LogColumns:
     degrees: float = 1.0  # of latitude and longitude in the file's unit
     heading_unit: str = ""  # rad or deg; "": recognised
     has_units: bool = True  # whether the TOML says the unit of x and y
-    is_clock: bool = False  # whether t is a time of day
+    turn_s: float = DAY_S  # s after which the clock begins anew
     notes: tuple[str, ...] = ()
 
     def distance(self, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
@@ -170,10 +186,6 @@ def columns_of(table: Table, spec: Mapping) -> LogColumns:
         )
     clock = next(name.lstrip("-") for field, name, _ in found if field == "t")
     form, factor = _time(table, clock, units.get("t"), rate, notes)
-    is_clock = bool(re.search("%[HI]", form)) and not re.search("%[djcxU]", form)
-    is_clock |= form in CLOCK_DIGITS
-    if form == ISO:
-        is_clock = re.match(r"\d{1,2}:\d", first_cell(table, clock)) is not None
     return LogColumns(
         fields=tuple(_field(*one, units, spec, form, factor) for one in found),
         rate_hz=rate,
@@ -182,7 +194,7 @@ def columns_of(table: Table, spec: Mapping) -> LogColumns:
         degrees=degrees,
         heading_unit=units.get("heading", ""),
         has_units="x" in section(spec, "units") or middle is not None,
-        is_clock=is_clock,
+        turn_s=HOUR_S if form.startswith("%M") else DAY_S,
         notes=tuple(notes),
     )
 
@@ -228,6 +240,9 @@ def _named(
             "north and y east: swap them (y must lie left of x); where the names are "
             "wrong, give others by names of [table]"
         )
+    for axis, name in own.items():
+        if is_in_pixels(name) and axis not in section(spec, "scale"):
+            raise InputError(f"{where}{axis}: {name}: expected metres; {OF_PIXELS}")
     texts = {columns[field] for field in TEXT if field in columns}
     for field, column in columns.items():
         if field not in TEXT and column in texts:
@@ -238,8 +253,11 @@ def _named(
     if "x" in units or "y" in units or is_wide:
         return columns, units, []
     for x, y in (("x", "y"), ("y", "x")):  # degrees, by their names and cells
-        own = {"x": columns[x], "y": columns[y]}
-        if all(EARTH_WORDS[a] & words_of(n) and table.has(n) for a, n in own.items()):
+        own, names = {"x": columns[x], "y": columns[y]}, every_word()["fields"]
+        if all(
+            words_of(own[axis]) & {*names[name]} and table.has(own[axis])
+            for name, axis in EARTH.items()
+        ):
             values = {axis: sampled(table, name) for axis, name in own.items()}
             if all(v.size and np.abs(v).max() <= DEGREES[a] for a, v in values.items()):
                 note = f"columns {columns[x]}, {columns[y]}: longitude and latitude"
@@ -269,11 +287,12 @@ def date_pattern(cells: Sequence[str]) -> str:
     """Returns the pattern of strptime that all cells have; "" if none is known."""
     if cells and all(map(DATE_DIGITS.fullmatch, cells)):
         return DATE + ("%f" if len(cells[0]) > 14 else "")
-    for parts in itertools.product(DATES, TIMES_OF_DAY) if cells else ():
+    dated = map("".join, itertools.product(DATES, SEPARATORS, TIMES_OF_DAY))
+    for pattern in itertools.chain(CLOCK_PATTERNS, dated) if cells else ():
         with contextlib.suppress(ValueError):
             for cell in cells:
-                datetime.datetime.strptime(cell, " ".join(parts))
-            return " ".join(parts)
+                datetime.datetime.strptime(cell, pattern)
+            return pattern
     return ""
 
 
@@ -487,6 +506,7 @@ def _field(
         offset=offset,
         factor=-factor if plain != name else factor,
         limit=limit,
+        hint=HINTS.get("earth" if is_place_on_earth else field, ""),
         zero_is_empty=is_place_on_earth,
         user=user,
     )

@@ -24,7 +24,7 @@ from rcirl_jax.data.formats.csv.columns import (
     date_pattern,
     known_cells,
 )
-from rcirl_jax.data.formats.csv.names import kind_by_name, unit_of
+from rcirl_jax.data.formats.csv.names import is_in_pixels, kind_by_name, unit_of
 from rcirl_jax.data.formats.options import UNITS
 from rcirl_jax.data.readers.tables.rows import RowStats
 from rcirl_jax.data.readers.tables.table import Field, Table, batches
@@ -95,6 +95,7 @@ def head_of_table(table: Table) -> Head:
         n: unit_of(n, EVERY_UNIT) or unit_of(f"[{u}]", EVERY_UNIT) or u
         for n, u in units.items()
     }
+    stated.update((n, "px") for n in names if is_in_pixels(n))
     return Head(
         units=stated,
         codes=codes,

@@ -8,6 +8,7 @@ from rcirl_jax.runtime.specs import load_toml, spec_root
 
 WORD = r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+"  # of a name in camel case too
 PIXELS = {"px", "pix", "pixel", "pixels"}  # words of a name, of no use as metres
+PICTURE = {"img", "image", "bild"}  # likewise, of a place
 
 
 def words_of(name: str) -> set[str]:
@@ -56,17 +57,20 @@ def compass_axis(name: str) -> str:
 
 
 def is_no_place(name: str, header: Sequence[str]) -> bool:
-    """True for a coordinate in pixels, or of another point than the middle.
+    """True for a coordinate of another point than the middle, or perhaps in pixels.
 
     A column without a unit is one of pixels where another is called alike, with a unit.
     """
-    said = with_unit_apart(name)
-    if re.search(r"\[(px|pix|pixels?)\]$", said) or set(plain_words(name)) & PIXELS:
-        return True
     if not set(every_word()["not_middle"]).isdisjoint(plain_words(name)):
         return True
-    twins = (with_unit_apart(other) for other in header if other != name)
-    return said == name and any(twin.startswith(f"{name} [") for twin in twins)
+    twin = re.compile(rf"{re.escape(name)}[ _]?[\[(]?(ft|feet|m|met(er|re)s?|cm)[\])]?")
+    return any(twin.fullmatch(other) for other in header)
+
+
+def is_in_pixels(name: str) -> bool:
+    """True for a place or size in a picture, by its name."""
+    words = words_of(with_unit_apart(name))
+    return bool(words & PIXELS or (words & PICTURE and words & {"x", "y"}))
 
 
 def unit_of(name: str, allowed: Sequence[str]) -> str:
@@ -86,6 +90,7 @@ def fields_by_name(header: Sequence[str]) -> dict[str, str]:
     words = {name: plain_words(name) for name in header if name}
     met = [word for own in words.values() for word in set(own)]
     common = {w for w in met if len(words) > 3 and met.count(w) > len(words) / 2}
+    words = {name: own for name, own in words.items() if not is_in_pixels(name)}
     found: dict[str, str] = {}
     axes = {name: compass_axis(name) for name in words}
     if not {"x", "y"} <= {*axes.values()}:  # one alone may be another word: x_est
@@ -109,6 +114,8 @@ def fields_by_name(header: Sequence[str]) -> dict[str, str]:
                 scores[name] = last, len(set(own)) - 1, min(hits)
         if scores:
             found[field] = min(scores, key=lambda name: scores[name])
+        if field == "lon" and not {"lat", "lon"} <= found.keys():
+            found = {k: v for k, v in found.items() if k not in ("lat", "lon")}
     others = ("x", "y") if {"lat", "lon"} <= found.keys() else ("lat", "lon")
     return {field: name for field, name in found.items() if field not in others}
 

@@ -122,7 +122,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
             log.stats,
             is_long=is_long_file(file, spec),
             distance=columns.distance,
-            is_clock=columns.is_clock,
+            turn_s=columns.turn_s,
         ) as rows:
             check_clock(file, rows.seconds(), columns)
             every = rows.recordings()

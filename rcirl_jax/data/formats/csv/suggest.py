@@ -20,8 +20,10 @@ from rcirl_jax.data.formats.csv.columns import (
     CONVENTION,
     DEGREES,
     HOLE,
+    ISO_TIMES,
     NEEDED,
     NO,
+    OF_PIXELS,
     OPTIONAL,
     RATE_HZ,
     UNCLEAR,
@@ -42,6 +44,7 @@ from rcirl_jax.data.formats.csv.content import fields_by_content, unclear
 from rcirl_jax.data.formats.csv.names import (
     fields_by_name,
     foreign_words,
+    is_in_pixels,
     kind_by_name,
     unit_of,
 )
@@ -194,6 +197,8 @@ def _guess_columns(table: Table) -> _Guess:
             names = unclear(table, field, [*guess.columns.values()])[:NAMES_SHOWN]
             guess.columns[field] = UNCLEAR
             guess.comments[field] = f"one of: {', '.join(names)}"
+            if any(map(is_in_pixels, names)):
+                guess.comments[field] += f"; {OF_PIXELS}"
     order = [*needed, *guess.columns]
     columns = {f: guess.columns[f] for f in order if f in guess.columns}
     return dataclasses.replace(guess, columns=columns)
@@ -212,12 +217,12 @@ def _first_rows(path: Path, spec: Mapping) -> tuple[Log, Rows]:
 def _guess_time_form(table: Table, guess: _Guess) -> None:
     """Unit of times that are no seconds, milliseconds or frames: by the first cell."""
     first = first_cell(table, guess.columns["t"])
-    if re.match(r"\d{4}[-/]\d|\d{8}T\d|\d{1,2}:\d", first):
-        guess.units["t"] = "iso"
-    elif NUMBER.fullmatch(first) and abs(float(first)) > MAX_TIME:
-        guess.units["t"] = "ns" if float(first) > 1e3 * MAX_TIME else "us"
+    if re.match(ISO_TIMES, first):
+        guess.units["t"] = ISO
     elif pattern := date_pattern(known_cells(table, guess.columns["t"])):
         guess.units["t"] = pattern
+    elif NUMBER.fullmatch(first) and abs(float(first)) > MAX_TIME:
+        guess.units["t"] = "ns" if float(first) > 1e3 * MAX_TIME else "us"
     else:
         _guess_clock_digits(table, guess)
     found = sampled(table, guess.columns["lat"]) if "lat" in guess.columns else None

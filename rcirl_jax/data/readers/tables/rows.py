@@ -245,19 +245,26 @@ def drop_position_outliers(
     return {name: column[kept] for name, column in rows.items()}
 
 
-def after_midnight(t: np.ndarray) -> np.ndarray:
-    """Returns times of day [n] s, those after midnight a day later.
+def after_turn(t: np.ndarray, turn_s: float = DAY_S) -> np.ndarray:
+    """Returns times [n] s of a clock without a date, those after midnight a day later.
 
     A recording goes over midnight if it has rows just before and just after; it then
-    begins after the longest time without rows. One that fills the day stays as it is.
+    begins after the longest time without rows. One that fills the day stays as it is,
+    and so do times of a date, which are of a later day than the first.
+
+    Args:
+      t: [n] s.
+      turn_s: s after which the clock begins anew: a day, or an hour.
     """
     times = np.unique(t)
     if times.size < 2:
         return t
-    midnight = np.floor(times[0] / DAY_S) * DAY_S
-    early, late = times[0] - midnight, DAY_S - (times[-1] - midnight)
+    begin = np.floor(times[0] / turn_s) * turn_s
+    early, late = times[0] - begin, begin + turn_s - times[-1]
     pauses = np.diff(times)
     longest = int(np.argmax(pauses))
-    if max(early, late) > NEAR_S or not NEAR_S < pauses[longest] < DAY_S:
+    if begin > 0.0 or late < 0.0 or max(early, late) > NEAR_S:
         return t
-    return np.where(t <= times[longest], t + DAY_S, t)
+    if pauses[longest] <= NEAR_S:
+        return t
+    return np.where(t <= times[longest], t + turn_s, t)

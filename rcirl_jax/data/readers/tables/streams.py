@@ -9,6 +9,7 @@ one line are held.
 import codecs
 import contextlib
 import io
+import re
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -39,6 +40,8 @@ BYTE_ORDERS = {
 }  # first bytes -> encoding, the longer first
 
 
+# beside ASCII no letters and no units
+NO_LETTERS = re.compile(r"[^\w\x00-\x7f°²³µ]|[¼-¾]|(?<=[a-z])[ªº¹]")
 # encodings that bytes do not tell apart, the likelier first; those of one byte a
 # character, and others
 ONE_BYTE = ("cp1252", "cp1250", "cp1251", "cp1253", "cp1254")
@@ -168,11 +171,16 @@ def head_of(
 
 
 def _by_names(data: bytes, known: Collection[str]) -> tuple[str, bool]:
-    """Returns the encoding in which most names are found, and whether it is a guess."""
+    """Returns the encoding in which most names are found, and whether it is a guess.
+
+    Of those that find as many it is the first in whose words all is letters: names of
+    columns in Japanese are signs and fractions in others.
+    """
     names = {name.casefold() for name in known if not name.isascii()}
     texts = {name: data.decode(name, "replace").casefold() for name in UNTOLD}
     found = {name: sum(n in text for n in names) for name, text in texts.items()}
-    best = max(UNTOLD, key=lambda name: found[name])  # the first of several
+    odd = {name: len(NO_LETTERS.findall(text)) for name, text in texts.items()}
+    best = max(UNTOLD, key=lambda name: (found[name], -odd[name]))
     is_same = len({texts[name] for name in ONE_BYTE}) == 1
     return best, not (found[best] or is_same)
 

@@ -68,6 +68,7 @@ class Field:
     offset: float = 0.0
     factor: float = 1.0  # of the unit
     limit: float = np.inf  # in the file's unit; beyond it a number is absurd
+    hint: str = ""  # what to do where a cell is bad
     zero_is_empty: bool = False  # a receiver without a fix is at 0 degrees
     # whose column it is, in a table that has a row for all of a moment
     user: str | None = None
@@ -262,7 +263,8 @@ class _Column:
             expected = "a text" if self.empty[row] else long
         elif np.isfinite(value) and abs(value) > field.limit:
             shown, expected = f"{value:g}", f"within {field.limit:g}"
-        return f"{field.column}: {shown}: expected {expected}"
+        hint = f"; {field.hint}" if field.hint else ""
+        return f"{field.column}: {shown}: expected {expected}{hint}"
 
 
 def _column(table: Table, field: Field, found: Any) -> _Column:  # noqa: ANN401
