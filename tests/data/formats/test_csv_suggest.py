@@ -1,6 +1,8 @@
 """A source TOML suggested for a table: what is recognised, and that it imports."""
 
+import datetime
 import gzip
+import tomllib
 
 import numpy as np
 import pyarrow as pa
@@ -131,6 +133,10 @@ PLACES = [
     # names of the compass count before the letters; the last are estimates
     *("Czas Nr Północ_X=y Wschód_Y=x", "t id Hochwert=y Rechtswert=x", "t id N=y E=x"),
     *("t id Norte=y Leste=x", "t id X_sever=y Y_vychod=x", "t id x_est=x y_est=y"),
+    # places in a picture, in several notations; degrees count in pairs
+    *("frame id x_img y_img x_world=x y_world=y", "frame id x y x[m]=x y[m]=y"),
+    "frame id X_Bild Y_Bild X_Welt=x Y_Welt=y",
+    *("t id Latitud=lat Longitud=lon", "t id X=x Y=y Longitud=length"),
 ]
 
 
@@ -145,6 +151,37 @@ def test_fields_by_names(names):
 def test_units_by_names():
     units = {"carCenterXft": "ft", "x_m": "m", "east": ""}
     assert {name: unit_of(name, ("m", "ft")) for name in units} == units
+
+
+@pytest.mark.parametrize(
+    "form",
+    ["%d-%b-%Y %H:%M:%S.%f", "%Y%m%d_%H%M%S.%f", "%I:%M:%S.%f %p", "%M:%S.%f"],
+)
+def test_clocks_and_dates_over_the_end_of_a_day(tmp_path, form):
+    """Without a date they go on after midnight, or after the full hour."""
+    start = datetime.datetime(2024, 5, 31, 23, 59, 54)
+
+    def clock(t):
+        return (start + datetime.timedelta(seconds=t)).strftime(form)
+
+    path = people.write(tmp_path, people.column(people.rows(), "t", clock))
+    _, toml, (made,) = taken(path)
+    assert toml["units"]["t"] == form
+    people.assert_same(made)
+
+
+def test_places_in_pixels_alone_need_a_scale(tmp_path):
+    table = people.column(people.column(people.rows(), "x", lambda x: 12.5 * x), "y",
+                          lambda y: 12.5 * y)  # fmt: skip
+    header = ["x_px" if n == "x" else "y_px" if n == "y" else n for n in people.HEADER]
+    path = people.write(tmp_path, table, header)
+    found = suggested(path)
+    assert "x_px" not in tomllib.loads(found.toml)["columns"].values()
+    columns = dict(zip(people.HEADER, header, strict=True))
+    line = people.refused(path, people.spec(tmp_path, columns))
+    assert "columns.x: x_px: expected metres; places in pixels take metres per" in line
+    scale = "[scale]\nx = 0.08\ny = 0.08"
+    people.assert_same(people.only(path, people.spec(tmp_path, columns, rest=scale)))
 
 
 def test_by_its_command(tmp_path):
@@ -259,3 +296,11 @@ def test_words_of_names_tell_the_encoding(tmp_path, encoding):
     assert toml.get("table", {}).get("encoding", "utf-8") == encoding
     assert "a guess" not in found.toml
     assert len(made.tracks) == 5
+
+
+def test_letters_tell_the_encoding_where_no_word_does(tmp_path):
+    header = ("時刻", "車両番号", "X座標", "Y座標", "方位角", "速度", "全長", "種別")
+    path = tmp_path / "log.csv"
+    path.write_bytes(people.text(people.rows(), header).encode("shift_jis"))
+    toml = tomllib.loads(suggested(path).toml)
+    assert toml["table"]["encoding"] == "shift_jis"

@@ -26,6 +26,8 @@ def test_a_table_of_ones_own_needs_a_source_or_the_usual_names(tmp_path):
     line = refused(recognised_format, tmp_path)
     assert line.startswith(f"{path}: format: not given: a table of no known")
     assert f"perhaps {source}, which is there" in line
+    path.write_text(POINTER)
+    assert refused(recognised_format, tmp_path).startswith(f"{path}: Git LFS pointer")
 
 
 def test_what_is_nothing_or_several_is_one_line(tmp_path):

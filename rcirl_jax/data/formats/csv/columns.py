@@ -72,7 +72,10 @@ DEGREE_M = 111_320.0  # m of a degree of latitude
 MIDDLE_DIGITS = 2  # of latitude and longitude of the projection's middle
 RATE_HZ = 10.0  # 1/s
 # as read; not 07:15.2, which are minutes and seconds, nor 07:15:02.3 PM
-ISO_TIMES = r"\d{4}-\d\d-\d\d[T ]|\d{8}T\d|\d{4}/\d\d/\d\d |\d{1,2}:\d\d(?!\d*[.,]\d)(?!.*[AaPp]\.?[Mm])"
+ISO_TIMES = (
+    r"\d{4}-\d\d-\d\d[T ]|\d{8}T\d|\d{4}/\d\d/\d\d |"
+    r"\d{1,2}:\d\d(?!\d*[.,]\d)(?!.*[AaPp]\.?[Mm])"
+)
 # dates that are neither numbers nor ISO's; the day comes first where both orders fit
 DATES = (
     *("%d.%m.%Y", "%d.%m.%y", "%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y", "%d-%b-%Y"),
@@ -92,8 +95,8 @@ DATE_DIGITS = re.compile(
 )
 CLOCK_FROM = 1e6  # HHMMSSmmm from 00:10 on; numbers below it are common counters
 HINTS = {
-    "t": "units.t of the source TOML says how times are written: s, ms, us, ns, ..., or "
-    'a pattern such as "%d.%m.%Y %H:%M:%S.%f"',
+    "t": "units.t of the source TOML says how times are written: s, ms, us, ns, ..., "
+    'or a pattern such as "%d.%m.%Y %H:%M:%S.%f"',
     "earth": "degrees with decimals; south and west are negative",
 }  # of cells that cannot be read
 HOUR_S = 3600.0  # s

@@ -51,6 +51,7 @@ from rcirl_jax.data.formats.csv.names import (
 from rcirl_jax.data.formats.csv.reader import PATTERNS, Log, opened
 from rcirl_jax.data.formats.files import table_stem
 from rcirl_jax.data.formats.options import KINDS, UNITS
+from rcirl_jax.data.readers.tables.cells import ISO
 from rcirl_jax.data.readers.tables.rows import LINE, Rows, RowStats
 from rcirl_jax.data.readers.tables.streams import UNTOLD
 from rcirl_jax.data.readers.tables.table import (
