@@ -70,6 +70,8 @@ def is_no_place(name: str, header: Sequence[str]) -> bool:
 def is_in_pixels(name: str) -> bool:
     """True for a place or size in a picture, by its name."""
     words = words_of(with_unit_apart(name))
+    if re.match(r"px(?![^\W\d_])", name, re.IGNORECASE):
+        words.discard("px")  # position along x, as py is along y
     return bool(words & PIXELS or (words & PICTURE and words & {"x", "y"}))
 
 
