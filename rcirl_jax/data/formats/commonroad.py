@@ -19,7 +19,13 @@ import numpy as np
 
 from rcirl_jax.data.formats.files import files_below, log_name
 from rcirl_jax.data.formats.options import is_file_name, number, one_pattern
-from rcirl_jax.data.formats.shapes import arc_length, fractions, lane_between, resample
+from rcirl_jax.data.formats.shapes import (
+    arc_length,
+    centre_of_area,
+    fractions,
+    lane_between,
+    resample,
+)
 from rcirl_jax.data.formats.tracks import of_one_name
 from rcirl_jax.data.readers.xml import Node, read_xml
 from rcirl_jax.data.recording import validate_recording
@@ -377,10 +383,10 @@ def _position(state: Node) -> tuple[float, float]:
 
 def _middle(place: Node) -> tuple[float, float] | None:
     """(x, y) m: mean of the centres of a position's shapes; None without any."""
-    middles = [centre.point() for centre in place.each("*/center")]
+    middles = [np.array(centre.point()) for centre in place.each("*/center")]
     for polygon in place.each("polygon"):
         corners = [corner.point() for corner in polygon.each("point")]
-        middles += [np.mean(corners, axis=0)] if corners else []
+        middles += [centre_of_area(np.array(corners))] if corners else []
     if not middles:
         return None
     x, y = np.mean(middles, axis=0).tolist()

@@ -76,6 +76,23 @@ def resample(points: np.ndarray, at: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(at, share, points[:, i]) for i in (0, 1)], axis=1)
 
 
+def centre_of_area(corners: np.ndarray) -> np.ndarray:
+    """Returns the centre [2] m of a polygon's area; the corners' mean if it has none.
+
+        c = sum (p_i + p_i+1) (p_i x p_i+1) / (3 sum p_i x p_i+1)
+
+    Args:
+      corners: [n, 2] m, in order, the first not repeated at the end or repeated.
+    """
+    middle = corners.mean(axis=0)
+    here = corners - middle  # large coordinates would cancel
+    after = np.roll(here, -1, axis=0)
+    cross = here[:, 0] * after[:, 1] - here[:, 1] * after[:, 0]
+    if abs(cross.sum()) < 1e-9:
+        return middle
+    return middle + ((here + after) * cross[:, None]).sum(axis=0) / (3.0 * cross.sum())
+
+
 def moves(points: np.ndarray) -> np.ndarray:
     """Returns a mask [n] of points that differ from the one before; the first does."""
     return np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])

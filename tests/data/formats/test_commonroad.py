@@ -151,12 +151,18 @@ RECTANGLE = (
     "<position><rectangle><length>2</length><width>2</width>"
     "<center><x>25</x><y>1</y></center></rectangle></position>"
 )
+# an L of two rectangles, 128 m2 about (24, -2) and 64 m2 about (20, 6)
+CORNERS = [(16, -6), (32, -6), (32, 2), (24, 2), (24, 10), (16, 10)]
+POLYGON = f"<position>{w.bound('polygon', CORNERS)}</position>"
 ON_LANELET = '<position><lanelet ref="1"/></position>'
 
 
 @pytest.mark.parametrize(
     ("goal", "end"),
-    [(RECTANGLE, (25.0, 1.0)), (ON_LANELET, (30.0, 0.0)), ("", (30.0, 0.0))],
+    [
+        *((RECTANGLE, (25.0, 1.0)), (POLYGON, (22.667, 0.667))),
+        *((ON_LANELET, (30.0, 0.0)), ("", (30.0, 0.0))),
+    ],
 )
 def test_a_missing_agent_reaches_the_goal(tmp_path, goal, end):
     (agent,) = scenario(tmp_path, road(), w.problem(goal, speed=10.0)).missing_agents

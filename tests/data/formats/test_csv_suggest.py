@@ -111,6 +111,14 @@ def test_iso_times_and_degrees_in_parquet(tmp_path):
     assert "recognised: t: column datetime, iso" in found.lines
 
 
+def test_degrees_in_columns_called_x_and_y(tmp_path):
+    path = people.write(tmp_path, degrees(people.rows()))
+    found, toml, (made,) = taken(path)
+    assert (toml["units"]["x"], toml["units"]["y"]) == ("deg", "deg")
+    assert any("longitude and latitude" in line for line in found.lines)
+    people.assert_same(made, place=0.02)
+
+
 # header of a known tool, with the field that each column is
 TOOLS = {
     "SUMO": "timestep_time=t vehicle_angle=heading vehicle_id=id vehicle_lane=lane "

@@ -290,8 +290,10 @@ def date_pattern(cells: Sequence[str]) -> str:
     """Returns the pattern of strptime that all cells have; "" if none is known."""
     if cells and all(map(DATE_DIGITS.fullmatch, cells)):
         return DATE + ("%f" if len(cells[0]) > 14 else "")
+    if not cells or not cells[0][:1].isdigit() or NUMBER.fullmatch(cells[0]):
+        return ""  # a text or a number: none of the patterns need be tried
     dated = map("".join, itertools.product(DATES, SEPARATORS, TIMES_OF_DAY))
-    for pattern in itertools.chain(CLOCK_PATTERNS, dated) if cells else ():
+    for pattern in itertools.chain(CLOCK_PATTERNS, dated):
         with contextlib.suppress(ValueError):
             for cell in cells:
                 datetime.datetime.strptime(cell, pattern)

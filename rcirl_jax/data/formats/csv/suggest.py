@@ -48,7 +48,7 @@ from rcirl_jax.data.formats.csv.names import (
     kind_by_name,
     unit_of,
 )
-from rcirl_jax.data.formats.csv.reader import PATTERNS, Log, opened
+from rcirl_jax.data.formats.csv.reader import PATTERNS, STILL_M, Log, opened
 from rcirl_jax.data.formats.files import table_stem
 from rcirl_jax.data.formats.options import KINDS, UNITS
 from rcirl_jax.data.readers.tables.cells import ISO
@@ -316,6 +316,12 @@ def _guess_lengths(table: Table, raw: Rows, guess: _Guess) -> None:
         guess.units[field] = said or ("ft" if is_long else "m")
     if is_long:
         guess.said.append(f"length: {np.median(known):.3g} in the median: feet")
+    if "lat" in guess.columns or any(_said_unit(table, f, guess) for f in ("x", "y")):
+        return
+    span = max(np.ptp(raw["x"]), np.ptp(raw["y"]))
+    if 0.0 < span < STILL_M and np.abs(raw["y"]).max() <= DEGREES["y"]:
+        guess.units.update({"x": "deg", "y": "deg"})
+        guess.said.append(f"x, y: all within {span:.3g}: longitude and latitude")
 
 
 def _guess_heading_and_speed(table: Table, raw: Rows, guess: _Guess) -> None:
