@@ -1,1 +1,1 @@
-"""What `benchmarks.pictures` draws: ideas, drives, recorded scenes, numbers."""
+"""The drawings of `benchmarks.pictures`: ideas, drives, recorded scenes, numbers."""

@@ -1,1 +1,1 @@
-"""What a safety team tries first: kills, signals, and what comes out afterwards."""
+"""Tries what a safety team tries first: kills, signals, and what comes out of it."""

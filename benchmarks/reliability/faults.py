@@ -53,7 +53,7 @@ FINISHED = "holds a finished dataset"  # killed between its last file and its en
 
 @dataclasses.dataclass(kw_only=True)
 class Row:
-    """What came of one command."""
+    """The outcome of one command."""
 
     command: str
     undisturbed_s: float = 0.0

@@ -38,7 +38,7 @@ class Job:
 
 
 def different(found: Facts, expected: Facts) -> list[str]:
-    """What did not come out as expected, by name."""
+    """Returns what did not come out as expected, by name."""
     names = sorted(found.keys() | expected.keys())
     return [name for name in names if found.get(name) != expected.get(name)]
 

@@ -162,7 +162,7 @@ def imports() -> list[str]:
 
 
 def main() -> None:
-    """What is asked for; status 1 where memory grew."""
+    """Runs what is asked for; status 1 where memory grew."""
     works = {"suite": suite, "import": imports}
     problems = [text for name in _WHAT.value for text in works[name]()]
     print("\n".join(problems) or "bounded", flush=True)

@@ -28,7 +28,7 @@ class _Malloc(ctypes.Structure):
 
 
 def in_use_mb() -> float:
-    """What malloc has given and not got back, MiB.
+    """Returns what malloc has given and not got back, MiB.
 
     Resident memory has the room besides that it keeps or gives back as it likes, and
     falls by hundreds of MiB at once.

@@ -121,7 +121,7 @@ def _work(facts: Mapping[str, object]) -> Facts:
 
 
 def problems(series: Mapping[str, Sequence[float]]) -> list[str]:
-    """What has grown by more than is allowed."""
+    """Returns what has grown by more than is allowed."""
     resident = watched(series["rss_mb"])
     limits = {
         "rss_mb": max(RSS_SHARE * float(np.median(resident)), RSS_MB),

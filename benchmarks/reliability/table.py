@@ -93,7 +93,7 @@ def tree_sha256() -> str:
 
 
 def ran(row: Row, output: str) -> dict:
-    """What came of one row."""
+    """Runs one row and returns its outcome."""
     begin = time.monotonic()
     done = subprocess.run(
         words(row.command, output), cwd=ROOT, text=True, capture_output=True,

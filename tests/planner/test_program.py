@@ -82,21 +82,34 @@ FAULTS = {
 }  # fmt: skip
 
 
-def test_cases_without_a_plan_are_not_driven_and_the_others_are(tmp_path, capfd):
-    """Stations alone are a plan. A program that died is started anew."""
-    faults = {**FAULTS, CASE: f"dies once:{tmp_path / 'died'}"}
-    found = driven(faulty(*(f"{case}={kind}" for case, kind in faults.items())))
-    assert (tmp_path / "died").exists()
+@pytest.fixture(scope="module")
+def constant():
+    """Metrics of constant speed."""
+    return driven(rule_row("constant speed", "constant speed"))
+
+
+def test_cases_without_a_plan_are_not_driven_and_the_others_are(constant, capfd):
+    """Stations alone are a plan."""
+    found = driven(faulty(*(f"{case}={kind}" for case, kind in FAULTS.items())))
     lost = np.array([ref.id in FAULTS for ref in refs()])
+    assert sum(lost) == 4
     assert not_driven(found).tolist() == lost.tolist()
-    wanted = driven(rule_row("constant speed", "constant speed")).progress
-    np.testing.assert_allclose(found.progress[~lost], wanted[~lost], rtol=1e-3)
+    np.testing.assert_allclose(
+        found.progress[~lost], constant.progress[~lost], rtol=1e-3
+    )
     assert all(np.isfinite(found.progress))
     assert not found.holds[lost].any()
     line = capfd.readouterr().err
     assert line.startswith("not driven: ")
     assert ", step 0: " in line
     assert line.count("\n") == 1
+
+
+def test_a_program_that_died_is_started_anew(tmp_path, constant):
+    found = driven(faulty(f"{CASE}=dies once:{tmp_path / 'died'}"))
+    assert (tmp_path / "died").exists()
+    assert not not_driven(found).any()
+    np.testing.assert_allclose(found.progress, constant.progress, rtol=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What every reader promises of any bytes, and how a breach of it is seen.
+"""The promises of every reader about any bytes, and how a breach of one is seen.
 
 It returns, or it raises `InputError` (`WeightsError` for weights) of one printable
 line that names the file, and not because memory was refused. It writes nothing outside
@@ -60,7 +60,7 @@ sys.addaudithook(_hook)
 
 @contextlib.contextmanager
 def watched(folder: Path) -> Iterator[list[str]]:
-    """What is done inside the `with` block that the reader of a folder may not do."""
+    """Notes what is done inside the `with` block that a folder's reader may not do."""
     found: list[str] = []
     _readers.append((str(folder.resolve()), found))
     try:
@@ -70,7 +70,7 @@ def watched(folder: Path) -> Iterator[list[str]]:
 
 
 def breach(read: Callable[[Path], object], folder: Path, file: Path) -> str | None:
-    """What reading a folder breaks, if anything, when one of its files was changed.
+    """Returns what reading a folder breaks, if anything, when one file was changed.
 
     The line of a refusal names the folder or something in it. A user's own options
     may name another file, by its whole path.

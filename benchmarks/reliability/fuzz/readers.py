@@ -217,7 +217,7 @@ def suite(folder: Path) -> Target:
 
 
 def run(folder: Path) -> Target:
-    """What a run is resumed and exported from; no array is restored."""
+    """Reads what a run is resumed and exported from; no array is restored."""
     data: Any = types.SimpleNamespace(hash="d" * 64)
     describe_run(folder, TrainConfig(), data, {"git_commit": "2fe49aa"})
     step, line = folder / "3", {"loss": 0.5, "pair_accuracy": 0.75, "pairs": 64.0}
