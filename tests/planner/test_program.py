@@ -13,7 +13,12 @@ from rcirl_jax.evaluation.closed_loop.summary import format_suite
 from rcirl_jax.evaluation.gate.types import GateConfig, Pair
 from rcirl_jax.evaluation.gate.verdict import judge, repeats
 from rcirl_jax.export.closed_loop import checked_program, gate_job, table_rows
-from rcirl_jax.planner.program import check_program, processes_of, program
+from rcirl_jax.planner.program import (
+    check_program,
+    name_cases,
+    processes_of,
+    program,
+)
 from rcirl_jax.simulation.metrics import not_driven
 from rcirl_jax.simulation.rollout import first_scenes
 from rcirl_jax.simulation.rows import program_row, rule_row
@@ -180,6 +185,7 @@ def test_the_table_says_how_many_cases_were_not_driven_and_nothing_ships():
 
 def test_pictures_of_a_case_that_was_not_driven_have_numbers(capfd):
     row, cases = faulty("dies later"), build(refs()[:1], SECONDS)
+    name_cases({int(cases.seed[0]): refs()[0].id})
     logs = drive_with_logs(row, cases, rollout_config(row, SECONDS, 1))
     assert "case cut_in/000@0, step 20: " in capfd.readouterr().err
     assert not_driven(logs[0]).all()
