@@ -77,11 +77,11 @@ def changes_of_lane(track: Track, graph: LaneGraph) -> list[list[float]]:
         if first == last or track.t[rows[last - 1]] - track.t[rows[first]] < STAYS_S:
             continue
         driven = list(dict.fromkeys(names[rows[first:last]].tolist()))
-        if before and lanes[before[0]] != lanes[driven[0]]:
-            beside = graph.beside_line(before[0])
-            if not graph.follows(before, driven) and beside.intersection(driven):
-                row = rows[first]
-                found.append([round(float(x[row]), 1) for x in (track.x, track.y)])
+        # also one that comes over behind the end of its lane
+        is_beside = before and lanes[driven[0]] in graph.lines_beside(lanes[before[0]])
+        if is_beside and not graph.follows(before, driven):
+            row = rows[first]
+            found.append([round(float(x[row]), 1) for x in (track.x, track.y)])
         before = driven
     return found
 

@@ -12,11 +12,12 @@ from rcirl_jax.data.roads import roads_from_tracks
 from rcirl_jax.data.scenes.lanes import LaneGraph, project
 from rcirl_jax.types import Recording
 from tests.data.formats.fixtures.drives import straight
-from tests.helpers.driven_roads import crossing, motorway
+from tests.helpers.driven_roads import crossing, late_exit, motorway
 
 DRIVEN = {
     "a motorway": motorway(),
     "a crossing": crossing(),
+    "a late exit": late_exit(),
 }
 
 
@@ -83,10 +84,12 @@ def test_widths_and_neighbours(case):
         assert np.isnan(roads.width)
         assert all(lane.left is lane.right is None for lane in roads.lanes)
         return
-    assert roads.width == pytest.approx(width, abs=0.1)
+    # a short way beside each other tells less of the width
+    least, off = {"a motorway": (3, 0.1), "a late exit": (1, 0.2)}[name]
+    assert roads.width == pytest.approx(width, abs=off)
     long = [x for x in roads.lanes if len(x.centre) > 60]
     pairs = [(x, by_id[x.left]) for x in long if x.left]
-    assert len(pairs) >= 3
+    assert len(pairs) >= least
     for right, left in pairs:
         middle = right.centre[len(right.centre) // 2]
         way = np.gradient(right.centre, axis=0)[len(right.centre) // 2]
@@ -126,8 +129,9 @@ def test_a_lane_ends_or_begins_beside_another(lane, at, side):
     assert np.max(turn / np.hypot(*way[1:].T)) < 0.01  # 1/m, no swerve
 
 
-def test_changes_of_lane_are_found_where_they_are():
-    driven, graph = DRIVEN["a motorway"], graph_of(roads_of("a motorway"))
+@pytest.mark.parametrize(("name", "least"), [("a motorway", 60), ("a late exit", 20)])
+def test_changes_of_lane_are_found_where_they_are(name, least):
+    driven, graph = DRIVEN[name], graph_of(roads_of(name))
     found = {x.id: changes_of_lane(x, graph) for x in driven.tracks}
     true = {x.id: [] for x in driven.tracks}
     for name, place in driven.changes:
@@ -136,7 +140,7 @@ def test_changes_of_lane_are_found_where_they_are():
         any(np.hypot(*(place - other)) < 40.0 for other in found[name])
         for name, place in driven.changes
     )
-    assert len(driven.changes) > 60
+    assert len(driven.changes) > least
     assert hits >= 0.95 * len(driven.changes)
     assert hits >= 0.95 * sum(len(places) for places in found.values())
 

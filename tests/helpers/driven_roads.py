@@ -128,6 +128,29 @@ def motorway(seed=0, *, minutes=6.0, width=3.5):
     return found
 
 
+def late_exit(seed=0, *, minutes=8.0, width=3.5):
+    """A lane and an exit that is beside it from 300 to 385 m, and entered late.
+
+    `changes` are (track, place [2] m) over the lane's edge.
+    """
+    rng, s = np.random.default_rng(seed), np.arange(801.0)
+    road = curve(s, 0.0 * s, heading=0.4)
+    exits = -width - np.maximum(s - 385.0, 0.0) ** 2 / 1400.0
+    lanes = {"0": road[0], "exit": beside(*road, exits)[330:]}
+    found, start = Driven([], lanes), 0.0
+    while start < 60.0 * minutes:
+        name, speed = str(len(found.tracks)), rng.uniform(18.0, 26.0)
+        share = ramp(s, rng.uniform(290.0, 330.0), speed * rng.uniform(3.0, 4.0))
+        left = share * exits * (rng.random() < 0.3)
+        made = (rng, name, road, lambda at, left=left: np.interp(at, s, left))
+        found.tracks.append(drive(*made, speed, start))
+        if left[-1]:
+            at = int(np.argmax(share > 0.5))
+            found.changes.append((name, beside(*road, left)[at]))
+        start += rng.exponential(4.0) + 1.5
+    return found
+
+
 def crossing(seed=0, *, minutes=8.0, arm=60.0, width=3.5):
     """Four arms with a lane each way: straight on, left and right from each."""
     rng, found = np.random.default_rng(seed), Driven([], {})

@@ -142,7 +142,16 @@ class Collector:
             return
         lane_ids = self.graph.match(smooth.x, smooth.y, smooth.heading)
         visited = collections.Counter(lane_ids[lane_ids != ""].tolist())
-        driven: dict[str, tuple[LaneFrame, Driver]] = {}  # by the lane of the start
+        driven: dict[str, tuple[LaneFrame, Driver]] = {}  # by a lane of the chain
+
+        def along(lane: str, start: int) -> dict | str:
+            if lane not in driven:
+                frame = self.graph.frame(self.graph.chain(lane, visited))
+                samples = slice(self._offset[number], self._offset[number + 1])
+                s, l = self._view(frame)[samples, :2].T.copy()
+                driven[lane] = frame, driver_of(s, l, rate)
+            return self._scene(number, start, *driven[lane])
+
         for start in starts.tolist():
             lane, now = str(lane_ids[start]), (smooth.first_frame + start) / rate
             end = min(now + HORIZON_S, float(track.t[-1]))
@@ -151,12 +160,12 @@ class Collector:
             elif not track.is_human(now - config.min_history_s, end):
                 row = "not_human"
             else:
-                if lane not in driven:
-                    frame = self.graph.frame(self.graph.chain(lane, visited))
-                    samples = slice(self._offset[number], self._offset[number + 1])
-                    s, l = self._view(frame)[samples, :2].T.copy()
-                    driven[lane] = frame, driver_of(s, l, rate)
-                row = self._scene(number, start, *driven[lane])
+                row = along(lane, start)
+                if row == "far_from_road":
+                    # the driver goes over to a lane that then leaves, as an exit does
+                    later = lane_ids[start : start + round(HORIZON_S * rate) + 1]
+                    again = along(str(later[later != ""][-1]), start)
+                    row = row if isinstance(again, str) else again
             if isinstance(row, str):
                 self.dropped[row] += 1
                 continue

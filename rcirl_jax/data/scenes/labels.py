@@ -84,7 +84,8 @@ def labels_of(scenes: dict) -> tuple[np.ndarray, np.ndarray]:
 def _changes_lane(scenes: dict) -> np.ndarray:
     """[...] bool: moves by half a lane's width, towards where the road has a lane.
 
-    Where it has none, positions that wander change no lane.
+    Or from there, where it is on that lane at t = 0. Where the road has none,
+    positions that wander change no lane.
     """
     valid, l = scenes["time_valid"], scenes["human.l"]
     half = 0.5 * lane_width(scenes)
@@ -92,8 +93,9 @@ def _changes_lane(scenes: dict) -> np.ndarray:
     for side, name in ((1.0, "left"), (-1.0, "right")):
         lane = side * scenes[f"path.lane_{name}"]
         room = np.max(side * scenes[f"path.road_{name}"] - lane, axis=-1)
-        move = np.max(np.where(valid, side * (l - l[..., :1]), 0.0), axis=-1)
-        found |= (move > half) & (room > half)
+        moved = np.where(valid, side * (l - l[..., :1]), 0.0)
+        back = (side * l[..., 0] > half) & (np.min(moved, axis=-1) < -half)
+        found |= (room > half) & ((np.max(moved, axis=-1) > half) | back)
     return found
 
 

@@ -196,12 +196,12 @@ class LaneGraph:
                     name, here = here, before[here]
         return self._lines
 
-    def beside_line(self, name: str) -> frozenset[str]:
-        """Returns the neighbours of all pieces of a lane's line."""
+    def lines_beside(self, line: int) -> frozenset[int]:
+        """Returns the numbers of the lines of which a piece is beside one of a line."""
         lines = self.lines()
-        pieces = [self.lanes[x] for x, line in lines.items() if line == lines[name]]
-        found = {x for lane in pieces for x in (lane.left, lane.right) if x}
-        return frozenset(found)
+        pieces = [self.lanes[name] for name, number in lines.items() if number == line]
+        beside = (x for lane in pieces for x in (lane.left, lane.right))
+        return frozenset(lines[x] for x in beside if x in lines) - {line}
 
     def follows(self, before: Iterable[str], after: Iterable[str]) -> bool:
         """Returns whether one of the lanes leads into one of those after."""

@@ -195,6 +195,27 @@ def test_lane_change():
     assert row["path.l"][60] == pytest.approx(WIDTH, abs=0.1)
 
 
+def test_who_enters_an_exit_late_is_described_along_it():
+    """The driver was beside its first piece, on a lane that goes straight on."""
+    first, later = np.arange(0.0, 101.0, 5.0), np.arange(100.0, 501.0, 5.0)
+    away = lambda x: -WIDTH - 0.0008 * np.maximum(x - 100.0, 0.0) ** 2  # noqa: E731
+    lanes = (
+        lane("near", first, 0.0, right="exit", successors=("far",)),
+        lane("far", later, 0.0),
+        lane("exit", first, away(first), left="near", successors=("away",)),
+        lane("away", later, away(later)),
+    )
+    s = speeding_up(20.0)
+    ego = car("ego", s, y=lambda t: smooth_step(t, 5.5, 3.5) * away(s(t)))
+    made = recording(ego, lanes=lanes)
+    graph = LaneGraph(made)
+    assert "exit" not in graph.match(ego.x, ego.y, ego.heading)
+    row = first_scene(made)
+    assert row["human.l"][0] == pytest.approx(WIDTH, abs=0.05)
+    assert abs(row["human.l"][-1]) < 0.3
+    assert row["tags"][Tag.LANE_CHANGE]
+
+
 def braking_to(line, start=20.0, v=12.0, after=0.2):
     """Even braking to a standstill with the front at the line."""
     b = v**2 / (2.0 * (line - 2.25 - start - v * after))

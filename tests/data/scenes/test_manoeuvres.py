@@ -143,6 +143,8 @@ def test_a_single_lane_has_no_change_of_lane():
     x = np.arange(0.0, 501.0, 5.0)
     wander = car("ego", speeding_up(20.0), y=lambda t: 2.2 * smooth_step(t, 1, 5) - 1.0)
     lead = car("lead", speeding_up(60.0))
-    row = first_scene(recording(wander, lead, lanes=(lane("only", x, 0.0),)))
-    assert not row["tags"][Tag.LANE_CHANGE]
+    back = car("ego", speeding_up(20.0), y=lambda t: 2.1 - 2.1 * smooth_step(t, 1, 5))
+    for one in (wander, back):
+        row = first_scene(recording(one, lead, lanes=(lane("only", x, 0.0),)))
+        assert not row["tags"][Tag.LANE_CHANGE]
     assert first_scene(recording(wander, lead))["tags"][Tag.LANE_CHANGE]
