@@ -49,6 +49,9 @@ MOST_SHIFT_M = 0.12  # m that smoothing may move a lane
 SURE = 0.9  # share of the way driven on lanes, below which they are doubtful
 VOTES = 0.25  # share of a lane's drivers that makes a successor
 
+# a track, and for each sample the log's own number of the lane, "" where it has none
+Numbered = tuple[Track, np.ndarray]
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Samples:
@@ -746,6 +749,7 @@ class Roads:
     lanes: tuple[Lane, ...]
     explained: float  # share of the way driven that lies on one of them
     width: float  # m between lanes that adjoin, NaN where none do
+    is_numbered: bool = False  # they are made of the log's lane numbers too
     files: int = 1  # of whose tracks they are made
 
     def explains(self, tracks: Sequence[Track]) -> float:
@@ -774,45 +778,49 @@ class Roads:
         """Says what was found, in a line, and what to do where that is not enough."""
         names = {lane.id.partition(".")[0] for lane in self.lanes}
         apart = "" if np.isnan(self.width) else f", {self.width:.1f} m apart"
-        files = f" of {self.files} files" if self.files > 1 else ""
+        given = "only numbers of lanes" if self.is_numbered else "no lanes"
+        of = " and their numbers" if self.is_numbered else ""
+        of += f" of {self.files} files" if self.files > 1 else ""
         remedy = "" if self.explained >= SURE else "; give lanes where they are wrong"
         return (
-            f"no lanes given; {len(names)} estimated from all tracks{files}{apart}; "
+            f"{given} given; {len(names)} estimated from all tracks{of}{apart}; "
             f"{self.explained:.0%} of the way driven lies on them{remedy}"
         )
 
 
 def roads_of_sites(
-    files: Sequence[Sequence[Track]], *, width: float = WIDTH_M, limit: float | None
+    files: Sequence[Sequence[Numbered]], *, width: float = WIDTH_M, limit: float | None
 ) -> list[Roads]:
     """Estimates lanes from all files of one site together, in one frame.
 
     Files are of one site if the lanes of the one with most driving explain the others.
 
     Args:
-      files: the tracks of each.
+      files: of each the tracks, and for each the lane numbers of the log.
       width: m, as of `roads_from_tracks`.
       limit: m/s, likewise.
 
     Returns:
       The roads of each file's site.
     """
-    options = {"width": width, "limit": limit}
-    order = sorted(range(len(files)), key=lambda n: -sum(x.t.size for x in files[n]))
+
+    def roads_of(members: Sequence[int]) -> Roads:
+        driven = [one for number in members for one in files[number]]
+        tracks, labels = [x for x, _ in driven], [label for _, label in driven]
+        return roads_from_tracks(tracks, width=width, limit=limit, labels=labels)
+
+    order = sorted(range(len(files)), key=lambda n: -sum(x.t.size for x, _ in files[n]))
     sites: list[tuple[list[int], Roads]] = []
     for number in order:
         for members, roads in sites:
-            if roads.explains(files[number]) >= SURE:
+            if roads.explains([track for track, _ in files[number]]) >= SURE:
                 members.append(number)
                 break
         else:
-            sites.append(([number], roads_from_tracks(files[number], **options)))
+            sites.append(([number], roads_of([number])))
     found: dict[int, Roads] = {}
     for members, alone in sites:
-        roads = alone
-        if len(members) > 1:
-            every = [track for number in members for track in files[number]]
-            roads = roads_from_tracks(every, **options)
+        roads = roads_of(members) if len(members) > 1 else alone
         found |= dict.fromkeys(members, dataclasses.replace(roads, files=len(members)))
     return [found[number] for number in range(len(files))]
 
@@ -831,7 +839,7 @@ def roads_from_tracks(
       width: m of a lane that has none beside it.
       limit: m/s of every lane, or None.
       labels: for each track [n] texts, the log's own number of the lane; "" where it
-        says none. Lanes then have these names, and no position is on another.
+        says none. Lanes then have these names, and are made of these positions.
 
     Returns:
       The lanes, each with its neighbours and successors.
@@ -856,4 +864,5 @@ def roads_from_tracks(
         lanes=_pieces(ridges, beside, links, ended, found, limit),
         explained=float(np.mean(on >= 0)),
         width=spacing,
+        is_numbered=bool(np.any(samples.label != "")),
     )

@@ -12,7 +12,7 @@ from rcirl_jax.data.roads import roads_from_tracks
 from rcirl_jax.data.scenes.lanes import LaneGraph, project
 from rcirl_jax.types import Recording
 from tests.data.formats.fixtures.drives import straight
-from tests.helpers.driven_roads import crossing, late_exit, motorway
+from tests.helpers.driven_roads import crossing, dense, late_exit, motorway
 
 DRIVEN = {
     "a motorway": motorway(),
@@ -58,12 +58,6 @@ def test_every_true_lane_is_found_within_0_3_m(case):
         gap = found.data[found.query(inner)[1]] - inner
         left = way[:, 0] * gap[:, 1] - way[:, 1] * gap[:, 0]
         assert np.percentile(np.abs(left), 90) < 0.3, (name, lane)
-
-
-def dense(line):
-    """A line of points a metre apart, ten times as many."""
-    at = np.arange(0.0, len(line) - 1.0, 0.1)
-    return np.stack([np.interp(at, np.arange(len(line)), x) for x in line.T], axis=1)
 
 
 def test_there_is_no_lane_that_nobody_drives_on(case):

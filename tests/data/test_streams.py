@@ -6,12 +6,13 @@ import re
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from rcirl_jax import import_logs, open_dataset, read_logs
 from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.importing import import_logs as import_recordings
 from rcirl_jax.data.scenes.config import CollectConfig
-from tests.helpers.driven_roads import crossing, motorway
+from tests.helpers.driven_roads import crossing, dense, motorway
 
 
 @functools.cache
@@ -149,18 +150,19 @@ def test_ids_that_another_file_uses_again_are_others(tmp_path):
     assert "met again" not in dataset.manifest.import_flags["split_by"]
 
 
+def rows_of(tracks, low, high):
+    """Rows t, id, x, y of the tracks between two times."""
+    for number, track in enumerate(tracks):
+        first, last = max(track.t[0], low), min(track.t[-1], high)
+        for t in np.arange(np.ceil(10.0 * first), 10.0 * last) / 10.0:
+            x, y = (np.interp(t, track.t, one) for one in (track.x, track.y))
+            yield t, number, x, y
+
+
 def test_files_of_one_place_have_its_roads_and_those_of_another_their_own(tmp_path):
     """Four seconds have the lanes of the four minutes; the crossing keeps its own."""
     logs, road = tmp_path / "logs", motorway(minutes=4.0)
     logs.mkdir()
-
-    def rows_of(tracks, low, high):
-        for number, track in enumerate(tracks):
-            first, last = max(track.t[0], low), min(track.t[-1], high)
-            for t in np.arange(np.ceil(10.0 * first), 10.0 * last) / 10.0:
-                x, y = (np.interp(t, track.t, one) for one in (track.x, track.y))
-                yield t, number, x, y
-
     apart = crossing(minutes=3.0).tracks
     files = (
         (road.tracks, 0.0, 236.0),
@@ -178,3 +180,30 @@ def test_files_of_one_place_have_its_roads_and_those_of_another_their_own(tmp_pa
     assert len(names[2]) > 12
     for lane, other in zip(found[0].lanes, found[1].lanes, strict=True):
         np.testing.assert_allclose(lane.centre, other.centre)
+
+
+@pytest.mark.parametrize("others", [("41234", "41234")])
+def test_files_of_one_place_with_numbers_of_lanes_have_its_roads(tmp_path, others):
+    """They are of the tracks and the numbers of all."""
+    road, lines = motorway(minutes=3.0), ("slip", "0", "1", "2", "exit")
+    trees = [KDTree(road.lanes[name]) for name in lines]
+    for number, names in enumerate(("41234", *others)):
+        rows = np.array([*rows_of(road.tracks, 60.0 * number, 60.0 * number + 60.0)])
+        lane = np.argmin([tree.query(rows[:, 2:])[0] for tree in trees], axis=0)
+        text = [f"{t:.1f},{i:.0f},{x:.2f},{y:.2f}" for t, i, x, y in rows]
+        text = [f"{row},{names[n].strip()}" for row, n in zip(text, lane, strict=True)]
+        (tmp_path / f"{number}.csv").write_text("\n".join(["t,id,x,y,lane", *text]))
+    found = [*read_logs(tmp_path, format="csv")]
+    (note,) = (note for note in found[0].notes if "estimated" in note)
+    assert note.startswith("only numbers of lanes given; 5 estimated from all tracks")
+    assert "and their numbers of 3 files" in note
+    for one in found[1:]:
+        assert [x.id for x in one.lanes] == [x.id for x in found[0].lanes]
+        for lane, other in zip(found[0].lanes, one.lanes, strict=True):
+            np.testing.assert_allclose(lane.centre, other.centre)
+    lanes = [lane.centre for lane in found[0].lanes]
+    tree = KDTree(np.concatenate([dense(lane) for lane in lanes]))
+    for name in ("slip", "0", "1", "exit"):
+        apart = tree.query(road.lanes[name][5:-5])[0]
+        assert np.percentile(apart, 95) < 0.4, name
+        assert np.max(apart) < 0.7, name

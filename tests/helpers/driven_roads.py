@@ -31,6 +31,12 @@ def beside(points, heading, left):
     )
 
 
+def dense(line):
+    """A line of points a metre apart, ten times as many."""
+    at = np.arange(0.0, len(line) - 1.0, 0.1)
+    return np.stack([np.interp(at, np.arange(len(line)), x) for x in line.T], axis=1)
+
+
 def ramp(s, begin, length):
     """0 before, 1 after, smooth between."""
     u = np.clip((s - begin) / length, 0.0, 1.0)

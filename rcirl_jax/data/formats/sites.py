@@ -13,9 +13,15 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.recording import accepted
-from rcirl_jax.data.roads import SURE, Roads, roads_from_tracks, roads_of_sites
+from rcirl_jax.data.roads import (
+    SURE,
+    Numbered,
+    Roads,
+    roads_from_tracks,
+    roads_of_sites,
+)
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import OpenRoads, Recording, Track
+from rcirl_jax.types import OpenRoads, Recording
 
 BESIDE = "beside"  # in a spec: files of the import whose roads are pooled
 MAX_FILES = 12  # of these, evenly
@@ -43,7 +49,7 @@ def with_roads(name: str, read: Read, path: Path, spec: dict) -> Iterator[Record
             yield made
             continue
         is_alone = len(files) == 1 and made.piece_of is None
-        if is_alone or wanted.labels is not None:
+        if is_alone:
             roads = roads_from_tracks(
                 made.tracks,
                 width=wanted.width,
@@ -68,13 +74,13 @@ class Sites:
 
     def __init__(self, read: Read, files: Sequence[Path], spec: dict) -> None:
         self._read, self._spec = read, spec
-        driven: dict[tuple[Path, str], list[Track]] = {}
+        driven: dict[tuple[Path, str], list[Numbered]] = {}
         wanted = None
         for file in files:
             found, own = self._driven(file)
             driven |= found
             wanted = wanted or own
-        most = sorted(driven, key=lambda one: -sum(x.t.size for x in driven[one]))
+        most = sorted(driven, key=lambda one: -sum(x.t.size for x, _ in driven[one]))
         known = [one for one in driven if one in set(most[:MAX_PLACES])]
         self._known: dict[tuple[Path, str], Roads] = {}
         if wanted is not None:
@@ -90,43 +96,45 @@ class Sites:
         assert wanted is not None
         place = path, wanted.place
         if place not in self._known:
-            tracks = [*_thinned(made)]
+            driven = [*_thinned(made, wanted)]
             if made.piece_of is not None:
-                tracks = self._driven(path)[0].get(place, tracks)
+                driven = self._driven(path)[0].get(place, driven)
+            tracks = [track for track, _ in driven]
             fits = (site for site in self._sites if site.explains(tracks) >= SURE)
-            found = next(fits, None)
-            self._known[place] = found or roads_from_tracks(
-                tracks, width=wanted.width, limit=wanted.limit
+            self._known[place] = (
+                next(fits, None)
+                or roads_of_sites([driven], width=wanted.width, limit=wanted.limit)[0]
             )
         return self._known[place]
 
     def _driven(
         self, file: Path
-    ) -> tuple[dict[tuple[Path, str], list[Track]], OpenRoads | None]:
+    ) -> tuple[dict[tuple[Path, str], list[Numbered]], OpenRoads | None]:
         """The tracks of a file by place, as far as their roads are open.
 
         A file that cannot be read says so when it is imported itself.
         """
-        found: dict[tuple[Path, str], list[Track]] = {}
+        found: dict[tuple[Path, str], list[Numbered]] = {}
         wanted = None
         try:
             for made in self._read(file, self._spec):
                 own = made.open_roads
-                if own is not None and own.labels is None:
+                if own is not None:
                     wanted = own
-                    found.setdefault((file, own.place), []).extend(_thinned(made))
+                    found.setdefault((file, own.place), []).extend(_thinned(made, own))
         except InputError:
             return {}, None
         return found, wanted
 
 
-def _thinned(made: Recording) -> Iterator[Track]:
+def _thinned(made: Recording, wanted: OpenRoads) -> Iterator[Numbered]:
     """Yields a recording's tracks in the log's frame, with fewer samples."""
     step = max(round(made.rate_hz / THIN_HZ), 1)
-    for track in made.tracks:
+    labels = wanted.labels or [np.full(x.t.size, "") for x in made.tracks]
+    for track, label in zip(made.tracks, labels, strict=True):
         thin = {n: getattr(track, n)[::step] for n in ("t", "heading", "speed")}
         place = {
             name: getattr(track, name)[::step] + made.origin[at]
             for at, name in enumerate(("x", "y"))
         }
-        yield dataclasses.replace(track, **thin, **place)
+        yield dataclasses.replace(track, **thin, **place), label[::step].copy()
