@@ -156,17 +156,12 @@ class _Tracer:
         self.points, self.ways = np.zeros((0, 2)), np.zeros((0, 2))
         self.owner = np.zeros(0, int)  # ridge of each point
 
-    def nearest(
-        self, place: np.ndarray, way: np.ndarray, label: str
-    ) -> tuple[int, float]:
+    def nearest(self, place: np.ndarray, way: np.ndarray) -> tuple[int, float]:
         """Returns the ridge nearest to a place, the same way, and how far it is, m."""
         if not len(self.points):
             return -1, np.inf
         apart = np.hypot(*(self.points - place).T)
         apart = np.where(self.ways @ way > SAME_WAY, apart, np.inf)
-        if label:
-            own = np.array([ridge.label == label for ridge in self.ridges])
-            apart = np.where(own[self.owner], apart, np.inf)
         n = int(np.argmin(apart))
         return int(self.owner[n]), float(apart[n])
 
@@ -196,7 +191,7 @@ class _Tracer:
             place, way, number = self.settled(place + sense * STEP_M * way, way, label)
             if number < self.fewest:
                 return points, counts, -1
-            joined, apart = self.nearest(place, way, label)
+            joined, apart = self.nearest(place, way)
             if apart < JOIN_M:
                 return points, counts, joined
             if len(points) > 20 and np.hypot(*(place - begin)) < STEP_M:
@@ -210,7 +205,7 @@ class _Tracer:
         place, way, number = self.settled(place, way, label, 8)
         if number < self.fewest:
             return False
-        if self.nearest(place, way, label)[1] < COVERED * self.width:
+        if self.nearest(place, way)[1] < COVERED * self.width:
             return False
         own = len(self.ridges)
         ahead, after, last = self.trace(place, way, label, 1.0)
@@ -222,7 +217,7 @@ class _Tracer:
             return False
         if len(self.points):
             pairs = zip(line, _ways(line), strict=True)
-            apart = [self.nearest(*pair, label)[1] for pair in pairs]
+            apart = [self.nearest(*pair)[1] for pair in pairs]
             if np.median(apart) < 0.65 * self.width:
                 return False
         again = sum(ridge.label == label for ridge in self.ridges)
@@ -267,8 +262,6 @@ class _Tracer:
                 near = np.flatnonzero(np.isfinite(apart))
                 same = np.sum(_ways(line)[at[near]] * samples.way[near], axis=1)
                 same = same > SAME_WAY
-                if label := self.ridges[-1].label:
-                    same &= samples.label[near] == label
                 open_[near[same]] = False
 
 

@@ -182,9 +182,9 @@ def test_files_of_one_place_have_its_roads_and_those_of_another_their_own(tmp_pa
         np.testing.assert_allclose(lane.centre, other.centre)
 
 
-@pytest.mark.parametrize("others", [("41234", "41234")])
+@pytest.mark.parametrize("others", [("41234", "41234"), ("23142", "     ")])
 def test_files_of_one_place_with_numbers_of_lanes_have_its_roads(tmp_path, others):
-    """They are of the tracks and the numbers of all."""
+    """One lane is at a place, also where files number it differently or not at all."""
     road, lines = motorway(minutes=3.0), ("slip", "0", "1", "2", "exit")
     trees = [KDTree(road.lanes[name]) for name in lines]
     for number, names in enumerate(("41234", *others)):
@@ -202,6 +202,7 @@ def test_files_of_one_place_with_numbers_of_lanes_have_its_roads(tmp_path, other
         for lane, other in zip(found[0].lanes, one.lanes, strict=True):
             np.testing.assert_allclose(lane.centre, other.centre)
     lanes = [lane.centre for lane in found[0].lanes]
+    assert sum(map(len, lanes)) < 3000  # points a metre apart, of 2760 m
     tree = KDTree(np.concatenate([dense(lane) for lane in lanes]))
     for name in ("slip", "0", "1", "exit"):
         apart = tree.query(road.lanes[name][5:-5])[0]
