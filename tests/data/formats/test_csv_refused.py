@@ -59,6 +59,10 @@ REFUSED = {
     "units.t: ms: the cells of t are such as '2024-05-20T10:00:00.000'": of(
         column(rows(), "t", ISO["ISO"]), units='t = "ms"'
     ),
+    # all unknown kinds of the file at once
+    "kind: bus, tractor: expected one of": of(
+        column(rows(), "kind", {"car": "tractor", "truck": "bus"}.get)
+    ),
     # places
     'longitude and latitude? say units.x = "deg", units.y = "deg"': of(
         degrees(rows()), columns=HEADER[:4]

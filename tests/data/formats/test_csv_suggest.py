@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from rcirl_jax.data.formats.csv.names import fields_by_name, unit_of
+from rcirl_jax.data.formats.csv.names import base_of, fields_by_name, unit_of
 from rcirl_jax.data.formats.csv.suggest import suggested
 from rcirl_jax.runtime.specs import load_toml
 from tests.data.formats import people
@@ -145,6 +145,12 @@ PLACES = [
     *("frame id x_img y_img x_world=x y_world=y", "frame id x y x[m]=x y[m]=y"),
     "frame id X_Bild Y_Bild X_Welt=x Y_Welt=y",
     *("t id Latitud=lat Longitud=lon", "t id X=x Y=y Longitud=length"),
+    # other cases and numbers of known words, with and without accents
+    "Znacznik_czasu=t Numer_obiektu=id X Y Wartość_prędkości=speed Temp Predkosc_max",
+    "Razítko_času=t Čísla_vozidel=id X Y Délky=length Smery=heading",
+    "Zeitpunkt=t Fahrzeugs=id X Y Largeurs=width",
+    *("Data_e_hora=t Veículos=id X Y Rumo=heading", "Tidpunkt=t Tracks=id X Y"),
+    *("Marca_de_tiempo=t Coche X Y", "Date_et_heure=t Idx X Y", "Horodatage=t Id=id"),
 ]
 
 
@@ -154,6 +160,18 @@ def test_fields_by_names(names):
     found = fields_by_name([column for column, _, _ in pairs])
     for column, _, field in pairs:
         assert not field or found.get(field) == column
+
+
+def test_a_shorter_word_is_no_other_case():
+    words = ("temp", "data", "heading", "ori", "driver", "limits")
+    assert [*map(base_of, words)] == [
+        "temp",
+        "data",
+        "heading",
+        "ori",
+        "driver",
+        "limit",
+    ]
 
 
 def test_units_by_names():
@@ -277,8 +295,10 @@ def test_what_nothing_tells_is_left_open(tmp_path):
     path = strange(tmp_path, drop=("qa",), header=[*STRANGE[:1], "id", *STRANGE[2:]])
     found, source = suggested(path), tmp_path / "draft.toml"
     source.write_text(found.toml)
-    columns = load_toml(source)["columns"]
+    toml = load_toml(source)
+    columns, units = toml["columns"], toml["units"]
     assert (columns["t"], columns["id"]) == ("?", "id")
+    assert [*units] == [field for field in columns if field in units]
     assert 't = "?"  # one of: qc, ' in found.toml
     assert any(line.startswith("not known: t: one of: qc, ") for line in found.lines)
     assert found.last.startswith('fill in the lines with "?" before you import; words ')
@@ -312,3 +332,144 @@ def test_letters_tell_the_encoding_where_no_word_does(tmp_path):
     path.write_bytes(people.text(people.rows(), header).encode("shift_jis"))
     toml = tomllib.loads(suggested(path).toml)
     assert toml["table"]["encoding"] == "shift_jis"
+
+
+def changed(path, **changes):
+    """That table with other cells in some columns, at those numbers: _0=..."""
+    lines = [line.split(";") for line in path.read_text().splitlines()]
+    is_row = [line[2][-1:].isdigit() for line in lines]
+    for name, change in changes.items():
+        for line in (one for one, good in zip(lines, is_row, strict=True) if good):
+            line[int(name[1:])] = change(line[int(name[1:])])
+    path.write_text("\n".join(map(";".join, lines)) + "\n")
+    return path
+
+
+def date(zone):
+    """A change of seconds into dates whose day comes first."""
+    start = datetime.datetime(2025, 3, 7, 6, 58)
+
+    def written(cell):
+        time = start + datetime.timedelta(seconds=float(cell))
+        return f"{time:%d.%m.%Y %H:%M:%S}.{time.microsecond // 1000:03d}{zone}"
+
+    return written
+
+
+@pytest.mark.parametrize("unit", ["dd.mm.rrrr gg:mm:ss,fff", "-"])
+@pytest.mark.parametrize(
+    ("zone", "form"), [("", ""), (" +01:00", " %z"), ("+0100", "%z"), ("Z", "%z")]
+)
+def test_dates_with_a_zone_by_their_content(tmp_path, zone, form, unit):
+    """Whatever the line of units says of them; 06:58 is an hour earlier in UTC."""
+    path = changed(strange(tmp_path), _0=date(zone))
+    path.write_text(path.read_text().replace("\ns;", f"\n{unit};"))
+    _, toml, (made,) = taken(path)
+    assert toml["columns"] == dict(zip(FIELDS, STRANGE, strict=True))
+    assert toml["units"]["t"] == f"%d.%m.%Y %H:%M:%S.%f{form}"
+    assert toml["defaults"]["rate_hz"] == 10.0
+    (track, *_) = made.tracks
+    np.testing.assert_allclose(np.diff(track.t), 0.1, atol=1e-5)
+
+
+def test_zones_are_read(tmp_path):
+    table = people.column(people.rows(), "t", lambda t: date(" +01:00")(t))
+    for row in table[360:]:  # the clocks go forward
+        row[0] = row[0].replace("06:58", "07:58").replace("+01", "+02")
+    path = people.write(tmp_path, table, ("Czas", *people.HEADER[1:]))
+    _, _, (made,) = taken(path)
+    people.assert_same(made)
+
+
+NAMED = ("Czas", "id", "x", "y", "Azymut", "speed", "length", "type", "width")
+
+
+@pytest.mark.parametrize("drop", ["qf", ""])
+def test_a_time_that_nobody_reads(tmp_path, drop):
+    """The draft has what does not depend on it; speeds tell the rate, if they can."""
+    path = strange(tmp_path, units=False, header=NAMED, drop=(drop,))
+    found = suggested(changed(path, _0=lambda cell: f"klatka {float(cell):.1f}"))
+    toml = tomllib.loads(found.toml)
+    reason = "t = \"?\"  # one of: Czas; its cells are such as 'klatka 0.0', no time in"
+    assert reason in found.toml
+    assert 't = "?"  # one of s, ms, us, ' in found.toml
+    assert (toml["columns"]["t"], toml["units"]["t"]) == ("?", "?")
+    assert toml["heading_convention"] == "cw_from_north"
+    assert toml["kinds"] == {"car": "vehicle", "truck": "vehicle"}
+    assert ("rate_hz = 10  # not measured" in found.toml) == bool(drop)
+    assert any(line.split()[:2] == ["id", "x"] for line in found.lines)
+    assert found.last.startswith("fill in")
+    source = tmp_path / "draft.toml"
+    source.write_text(found.toml.replace('"?"', '"Czas"', 1))
+    assert "units.t: ?: expected one of s, ms, " in people.refused(path, source)
+
+
+def test_kinds_are_told_without_a_place(tmp_path):
+    header = ("Czas", "id", "qc", "qd", "qe", "qf", "length", "type", "width")
+    kept = strange(tmp_path, units=False, header=header)
+    toml = tomllib.loads(
+        suggested(changed(kept, _2=lambda _: "1", _3=lambda _: "1")).toml
+    )
+    assert toml["columns"]["x"] == "?"
+    assert toml["kinds"] == {"car": "vehicle", "truck": "vehicle"}
+
+
+SIZES = [  # names of length and width, factor, units of length, width and places
+    ("length [cm]", "width [cm]", 100.0, ("cm", "cm", "m")),
+    ("length", "width", 100.0, ("cm", "cm", "m")),
+    ("length [ft]", "width [ft]", 3.2808, ("ft", "ft", "m")),
+    ("length", "width", 3.2808, ("ft", "ft", "ft")),
+    ("length", "width", 1000.0, ("mm", "mm", "m")),
+]
+
+
+@pytest.mark.parametrize(("length", "width", "factor", "units"), SIZES)
+def test_units_of_sizes_and_places(tmp_path, length, width, factor, units):
+    header = ["time", *NAMED[1:6], length, "type", width]
+    path = strange(tmp_path, units=False, header=header)
+    places = 3.2808 if units[2] == "ft" else 1.0
+
+    def times(by):
+        return lambda cell: f"{by * float(cell):.3f}"
+
+    path = changed(path, _2=times(places), _3=times(places), _6=times(factor),
+                   _8=times(factor))  # fmt: skip
+    _, toml, (made,) = taken(path)
+    found = toml["units"]
+    assert (found["length"], found["width"], found["x"]) == units
+    assert found["speed"] == "km/h"
+    np.testing.assert_allclose(made.tracks[0].length, 4.5, atol=0.11)
+
+
+@pytest.mark.parametrize("name", ["Azymut", "Bearing [deg]", "Kompass", "Rumbo"])
+def test_a_compass_tells_that_x_points_north(tmp_path, name):
+    """Surveyors' X and Y are swapped; an import that does not says so."""
+    right = strange(tmp_path, units=False, header=[*NAMED[:4], name, *NAMED[5:]])
+    right = changed(right)
+    (as_is,) = taken(right)[2]
+    header, rows = right.read_text().split("\n", 1)
+    right.write_text(f"{header.replace('x;y', 'Y;X')}\n{rows}")
+    found, toml, (made,) = taken(right)
+    assert (toml["columns"]["x"], toml["columns"]["y"]) == ("Y", "X")
+    assert toml["heading_convention"] == "cw_from_north"
+    assert f'x = "Y"  # swapped: {name} turns as a compass' in found.toml
+    for track, expected in zip(made.tracks, as_is.tracks, strict=True):
+        np.testing.assert_allclose(track.heading, expected.heading, atol=1e-6)
+    source = tmp_path / "mirrored.toml"
+    text = found.toml.replace('x = "Y"', 'x = "X"').replace('y = "X"', 'y = "Y"')
+    text = text.replace('heading_convention = "cw_from_north"', "")
+    source.write_text(text)
+    (mirrored,) = people.read(right, source)
+    assert any(f"{name} is a compass's by its name" in n for n in mirrored.notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "turn"), [("heading", 0.3), ("azimuth", np.pi / 4), ("azimuth", 0.3)]
+)
+def test_x_and_y_stay_where_no_compass_tells(tmp_path, name, turn):
+    """Named otherwise, or at 45 degrees, where both ways of counting are the same."""
+    table = people.column(people.rows(turn), "heading", np.rad2deg)
+    header = [name if n == "heading" else n for n in people.HEADER]
+    found = suggested(people.write(tmp_path, table, header))
+    is_compass = name == "azimuth" and turn == 0.3
+    assert ("swapped" in found.toml) == is_compass

@@ -86,6 +86,7 @@ TIMES_OF_DAY = (
     *("%H:%M:%S.%f", "%H:%M:%S,%f", "%H:%M:%S", "%I:%M:%S.%f %p", "%I:%M:%S %p"),
     *("%H%M%S.%f", "%H%M%S", "%H-%M-%S.%f", "%H.%M.%S.%f"),
 )
+ZONE = re.compile(r"( ?)(?:(UTC|GMT)|Z|[-+]\d\d:?\d\d)$")  # below a date and a time
 # without a date: of a day, as ISO does not write them, and of an hour
 CLOCK_PATTERNS = ("%I:%M:%S.%f %p", "%I:%M:%S %p", "%M:%S.%f", "%M:%S,%f")
 DATE = "%Y%m%d%H%M%S"
@@ -94,9 +95,10 @@ DATE_DIGITS = re.compile(
     r"(19|20)\d\d(0[1-9]|1[0-2])([0-2]\d|3[01])([01]\d|2[0-3])([0-5]\d){2}(\d{3}){0,2}"
 )
 CLOCK_FROM = 1e6  # HHMMSSmmm from 00:10 on; numbers below it are common counters
+PATTERN = 'or a pattern such as "%d.%m.%Y %H:%M:%S.%f"'  # of times
 HINTS = {
     "t": "units.t of the source TOML says how times are written: s, ms, us, ns, ..., "
-    'or a pattern such as "%d.%m.%Y %H:%M:%S.%f"',
+    + PATTERN,
     "earth": "degrees with decimals; south and west are negative",
 }  # of cells that cannot be read
 HOUR_S = 3600.0  # s
@@ -112,6 +114,10 @@ CONVENTIONS = {
     "cw_from_x": (-1.0, 0.0),
     "ccw_from_north": (1.0, 0.5 * math.pi),
 }
+MIRRORED = (
+    "is a compass's by its name, but turns counter-clockwise: x and y are mirrored if "
+    "x points north and y east (swap them), or the name is wrong"
+)  # after the name of a column of headings
 CONVENTION = "heading_convention"  # the options of this file
 AUTOMATED = "automated_values"
 MOVING_MPS = 0.5  # m/s; the direction of a slower velocity is noise
@@ -288,6 +294,11 @@ def sampled(table: Table, column: str) -> np.ndarray:
 
 def date_pattern(cells: Sequence[str]) -> str:
     """Returns the pattern of strptime that all cells have; "" if none is known."""
+    zones = [match for match in map(ZONE.search, cells) if match]
+    if zones and len(zones) == len(cells):
+        forms = {match[1] + ("%Z" if match[2] else "%z") for match in zones}
+        bare = date_pattern([ZONE.sub("", cell) for cell in cells])
+        return bare + forms.pop() if bare and len(forms) == 1 else ""
     if cells and all(map(DATE_DIGITS.fullmatch, cells)):
         return DATE + ("%f" if len(cells[0]) > 14 else "")
     if not cells or not cells[0][:1].isdigit() or NUMBER.fullmatch(cells[0]):
@@ -393,6 +404,7 @@ def _check_units(table: Table, spec: Mapping, units: dict[str, str]) -> None:
             raise InputError(
                 f"{table.path}: units.{field}: {unit}: "
                 f"expected one of {', '.join(ALLOWED_UNITS[field])}"
+                + (f", {PATTERN}" if field == "t" else "")
             )
     x, y = (units.get(axis, "m") for axis in "xy")
     if (x in ANGLES) != (y in ANGLES):
@@ -524,6 +536,7 @@ class HeadingForm:
     name: str = "ccw_from_x"
     unit: str = "rad"
     note: str = ""
+    turns_left: bool = False  # surely: no convention that turns right fits as well
 
     def radians(self, headings: np.ndarray) -> np.ndarray:
         """Returns headings [n] of the file in radians, counter-clockwise from +x."""
@@ -574,11 +587,17 @@ def meaning_of(
       InputError: headings that contradict the positions, a flag neither yes nor no.
     """
     flags = flags_of(path, automated, spec)
-    names, rate = {field.name for field in columns.fields}, columns.rate_hz
+    names = {field.name: field.column for field in columns.fields}
+    rate = columns.rate_hz
     if "heading" in names:
         form = heading_form(path, rows, columns.heading_unit, spec, rate)
-        return Meaning(form=form, flags=flags, notes=(form.note,) if form.note else ())
-    if {"vx", "vy"} <= names:  # they are in the frame of x and y
+        says = [compass_axis(names[field]) for field in ("x", "y", "heading")]
+        is_mirrored = form.turns_left and says == ["", "", "heading"]
+        is_mirrored &= columns.middle is None
+        mirrored = f"heading: {names['heading']} {MIRRORED}" if is_mirrored else ""
+        notes = tuple(filter(None, (form.note, mirrored)))
+        return Meaning(form=form, flags=flags, notes=notes)
+    if {"vx", "vy"} <= names.keys():  # they are in the frame of x and y
         usual = {CONVENTION: "ccw_from_x"}
         try:
             form = heading_form(path, map(with_velocity, rows), "rad", usual, rate)
@@ -730,13 +749,15 @@ def _fitting(
             "turn with it, or x and y are mirrored"
         )
         raise InputError(f"{path}: heading: {what}; {hint}")
-    if best == HeadingForm(name=said or "ccw_from_x", unit=unit or "rad"):
-        return best
-    note = (
+    is_usual = best == HeadingForm(name=said or "ccw_from_x", unit=unit or "rad")
+    note = "" if is_usual else (
         f"headings read as {best.name} in {best.unit}, which fits the direction of "
         "travel"
-    )
-    return dataclasses.replace(best, note=note)
+    )  # fmt: skip
+    others = [off for form, off in apart.items() if CONVENTIONS[form.name][0] < 0.0]
+    is_left = CONVENTIONS[best.name][0] > 0.0 and not said
+    is_left &= min(others, default=math.inf) > max(SURE, 2.0 * apart[best])
+    return dataclasses.replace(best, note=note, turns_left=is_left)
 
 
 def is_large(headings: np.ndarray) -> bool:

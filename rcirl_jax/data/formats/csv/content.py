@@ -66,6 +66,11 @@ class Head:
     numbers: Mapping[str, np.ndarray]  # [n] of the columns of numbers; NaN: unknown
     clocks: frozenset[str]  # columns of dates or times of day; numbers are their order
 
+    def may_be_time(self, column: str) -> bool:
+        """True for a date or time of day, and where the unit stated is none or fits."""
+        unit = self.units[column].strip("-")
+        return column in self.clocks or not unit or unit in TIMES
+
     def is_whole(self, column: str) -> bool:
         """True for numbers without decimals."""
         return all(re.fullmatch(r"-?\d*", text) for text in self.texts[column])
@@ -152,7 +157,8 @@ def unclear(table: Table, field: str, used: Sequence[str]) -> list[str]:
         return [n for n in rest if n not in head.numbers or head.is_whole(n)] or rest
     expected = TIMES if field == "t" else (*LENGTHS, *ANGLES)
     numbers = [n for n in rest if n in head.numbers]
-    stated = [n for n in numbers if head.units[n] in expected]
+    dates = head.clocks if field == "t" else ()
+    stated = [n for n in numbers if n in dates or head.units[n] in expected]
     return stated or [n for n in numbers if not head.units[n]] or rest
 
 
@@ -163,7 +169,7 @@ def _clock_and_user(head: Head, known: Mapping[str, str]) -> dict[str, Guessed]:
     taken = set(known.values())
     times = [known["t"]] if "t" in known else [
         n for n in head.numbers
-        if n not in taken and (not head.units[n] or head.units[n] in TIMES)
+        if n not in taken and head.may_be_time(n)
     ]  # fmt: skip
     users = [known["id"]] if "id" in known else [
         n for n in head.codes

@@ -2,6 +2,7 @@
 
 import functools
 import re
+import unicodedata
 from collections.abc import Sequence
 
 from rcirl_jax.runtime.specs import load_toml, spec_root
@@ -9,6 +10,9 @@ from rcirl_jax.runtime.specs import load_toml, spec_root
 WORD = r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+"  # of a name in camel case too
 PIXELS = {"px", "pix", "pixel", "pixels"}  # words of a name, of no use as metres
 PICTURE = {"img", "image", "bild"}  # likewise, of a place
+LISTS = ("other", "not_middle", "motion")  # of words, beside the sections
+SECTIONS = ("fields", "compass", "kinds")
+ENDINGS = "aeiouys"  # of cases and numbers, without accents, that words differ by
 
 
 def words_of(name: str) -> set[str]:
@@ -24,14 +28,45 @@ def every_word() -> dict:
 
 def foreign_words() -> list[str]:
     """Returns the words of fields and kinds that are not of ASCII alone."""
-    every = every_word()
-    sections = (every[name] for name in ("fields", "compass", "kinds"))
-    lists = [words for part in sections for words in part.values()]
+    lists = [words for part in SECTIONS for words in every_word()[part].values()]
     return [word for words in lists for word in words if not word.isascii()]
 
 
+def _bare(word: str) -> str:
+    """A word without its accents."""
+    letters = unicodedata.normalize("NFKD", word)
+    return "".join(letter for letter in letters if not unicodedata.combining(letter))
+
+
+@functools.cache
+def _known_words() -> tuple[set[str], dict[str, str]]:
+    """The words that are known as they are, and those by their letters."""
+    every = every_word()
+    lists = [words for part in SECTIONS for words in every[part].values()]
+    lists += [every[name] for name in LISTS]
+    known = [word for words in lists for word in words]
+    return {*known}, {_bare(word): word for word in reversed(known)}
+
+
+def base_of(word: str) -> str:
+    """Returns the known word of which a word is a case or number, else the word.
+
+    So "času", "délky", "prędkości" and "tracks" are čas, délka, prędkość and track.
+    """
+    known, by_letters = _known_words()
+    bare = _bare(word)
+    if word in known or len(bare) < 4:
+        return word
+    ends = ("", "a", "o") if bare[-1] in ENDINGS else ()
+    forms = (bare, *(bare[:-1] + end for end in ends))
+    return next((by_letters[form] for form in forms if form in by_letters), word)
+
+
 def plain_words(name: str) -> list[str]:
-    """Returns words of a column's name without those of a unit; owners stand apart."""
+    """Returns words of a column's name without those of a unit; owners stand apart.
+
+    What is a case or number of a known word is that word.
+    """
     bare = re.sub(r"[\[(].*?[\])]", " ", with_unit_apart(name))
     every = every_word()
     written = [text for texts in every["units"].values() for text in texts]
@@ -41,7 +76,8 @@ def plain_words(name: str) -> list[str]:
         glued = (o for o in owners if word.startswith(o) and len(word) > len(o) + 1)
         owner = next(glued, "")  # plurals stay whole
         words += [owner, word.removeprefix(owner)] if owner else [word]
-    return [w for w in words if w not in units and w not in ("kf", "smoothed", "raw")]
+    left_out = {*units, "kf", "smoothed", "raw"}
+    return [base_of(word) for word in words if word not in left_out]
 
 
 def with_unit_apart(name: str) -> str:
@@ -50,7 +86,7 @@ def with_unit_apart(name: str) -> str:
 
 
 def compass_axis(name: str) -> str:
-    """Returns x for a name that says east, y for one that says north; "" for others."""
+    """Returns x for a name that says east, y: north, heading: a compass's, else ""."""
     words = set(plain_words(name))
     said = [axis for axis, own in every_word()["compass"].items() if words & {*own}]
     return said[0] if len(said) == 1 else ""
@@ -124,7 +160,7 @@ def fields_by_name(header: Sequence[str]) -> dict[str, str]:
 
 def kind_by_name(text: str) -> str:
     """Returns the kind of a road user by a word of a name; "" unknown."""
-    words = words_of(text) | {text.lower()}
+    words = {*map(base_of, words_of(text)), text.lower()}
     for kind in ("cyclist", "pedestrian", "static", "vehicle"):
         if any(word in every_word()["kinds"][kind] for word in words):
             return kind

@@ -63,6 +63,7 @@ STILL_M = 0.5  # m; a log in which all road users stay within it is in degrees
 # box centre ahead of the recorded position, in box lengths
 REFERENCE = {"centre": 0.0, "front": -0.5, "rear": 0.5}
 SIZE_M = {"length": 4.5, "width": 1.8}  # m, a car
+MAX_NAMED = 40  # unknown kinds
 MARGIN_M = 50.0  # m of fitted lane beyond the first and last position
 LIMIT_MPS = 29.06  # m/s, 65 mph
 
@@ -75,6 +76,7 @@ class Log:
     spec: dict
     columns: LogColumns
     stats: RowStats
+    kinds: tuple[str, ...] = ()  # all texts of its kinds, once its rows are read
 
     def placed(self, rows: Rows) -> Rows:
         """Returns rows with x and y in metres."""
@@ -127,6 +129,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
             check_clock(file, rows.seconds(), columns)
             every = rows.recordings()
             minutes = (log.placed(part) for one in every for part in rows.minutes(one))
+            log = dataclasses.replace(log, kinds=tuple(rows.texts_of("kind")))
             automated = rows.texts_of("automated")
             meaning = meaning_of(file, minutes, automated, columns, spec)
             for recording in every:
@@ -223,11 +226,16 @@ def _track(name: str, rows: Rows, log: Log, meaning: Meaning) -> Track:
     del known[""]
     # the most frequent one
     found = max(known, key=lambda text: known[text], default=str(usual.get("kind", "")))
-    kind = str(section(spec, "kinds").get(found, found or "vehicle")).lower()
-    if kind not in KINDS:
+
+    def kind_of(text: str) -> str:
+        return str(section(spec, "kinds").get(text, text or "vehicle")).lower()
+
+    if kind_of(found) not in KINDS:
+        every = sorted({found, *log.kinds})
+        wrong = ", ".join([t for t in every if kind_of(t) not in KINDS][:MAX_NAMED])
         raise InputError(
-            f"{log.table.path}: id {name}: kind: {found}: expected one of "
-            f"{', '.join(KINDS)}, or an entry in [kinds]"
+            f"{log.table.path}: id {name}: kind: {wrong}: expected one of "
+            f"{', '.join(KINDS)}, or an entry in [kinds] for each"
         )
     reference = one_of(spec, "reference_point", REFERENCE, "centre")
     automated = np.zeros(rows["t"].size, bool)
@@ -235,7 +243,8 @@ def _track(name: str, rows: Rows, log: Log, meaning: Meaning) -> Track:
         automated = meaning.automated(rows["automated"])
     length, width = (number(usual, field, size) for field, size in SIZE_M.items())
     spans = spans_of(rows["t"], automated)
-    made = track_of(name, rows, Kind[kind.upper()], (length, width), automated=spans)
+    kind = Kind[kind_of(found).upper()]
+    made = track_of(name, rows, kind, (length, width), automated=spans)
     ahead = REFERENCE[reference] * made.length
     return dataclasses.replace(
         made,

@@ -6,6 +6,7 @@ tells is written as `?`, with the columns that it may be. Without one the TOML i
 back like any other: what is shown is what an import would take.
 """
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -17,15 +18,19 @@ import numpy as np
 
 from rcirl_jax.data.formats.csv.columns import (
     ALLOWED_UNITS,
+    CLOCKS,
     CONVENTION,
     DEGREES,
     HOLE,
     ISO_TIMES,
+    MIRRORED,
     NEEDED,
     NO,
     OF_PIXELS,
     OPTIONAL,
+    PATTERN,
     RATE_HZ,
+    TEXT,
     UNCLEAR,
     YES,
     LogColumns,
@@ -69,8 +74,11 @@ USUAL_RATES = (1, 2, 4, 5, 10, 12.5, 15, 20, 24, 25, 29.97, 30, 50, 60, 100, 120
 RATE_FITS = 0.1  # relative
 FRAMES_FIT = 0.02  # likewise, of a rate that speeds tell
 SPEED_FITS = 0.06  # likewise, of a unit of speed
+NOT_MEASURED = "not measured: rows per second of one road user"
 NO_RATE = "rate_hz: rows per second of one road user; 10 is assumed"
-LONG_CAR_M = 9.0  # m; a longer median vehicle was measured in feet
+# field -> m of the median vehicle at most, in the first unit in which it is no larger
+LARGE_M = {"length": 9.0, "width": 3.0}
+SIZE_UNITS = ("m", "ft", "cm", "mm")
 # recorded speed over that of the positions, both in m/s if it were m/s
 SPEED_RATIOS = {"m/s": 1.0, "km/h": 3.6, "ft/s": 3.2808, "mph": 2.2369, "kn": 1.9438}
 ROWS_SHOWN = 5
@@ -130,11 +138,20 @@ class _Guess:
         """Returns the needed fields of which nobody knows the column."""
         return [field for field, name in self.columns.items() if name == UNCLEAR]
 
+    @property
+    def is_untimed(self) -> bool:
+        """Returns whether the time alone is unclear: rows of one user tell an order."""
+        return self.unclear == ["t"] and HOLE not in self.columns.get("x", "")
+
     def spec(self) -> dict:
-        """As the TOML's content."""
+        """As the TOML's content; a place stands in for a time that nobody knows."""
         rate = {} if self.rate_hz is None else {"rate_hz": self.rate_hz}
         parts = ("columns", "units", "scale", "kinds")
-        options = {name: getattr(self, name) for name in parts}
+        options = {name: dict(getattr(self, name)) for name in parts}
+        if self.is_untimed:
+            place = "lat" if "lat" in self.columns else "x"
+            options["columns"]["t"] = self.columns[place].removeprefix("-")
+            options["units"]["t"] = "s"
         return {**options, "max_bad_rows": 0.5, **rate}
 
 
@@ -147,21 +164,37 @@ def suggested(path: Path) -> Suggestion:
     with as_input_error(str(path), "a table with a row per road user and time"):
         table = open_table(path, known=foreign_words())
         guess = _guess_columns(table)
-        if guess.unclear:
-            _guess_stated_units(table, guess)
-            lines = tuple(_in_words(table, guess, ()))
-            draft = _toml_of(path, guess, Meaning())
-            return Suggestion(toml=draft, lines=lines, last=FILL_IN)
-        _guess_time_form(table, guess)
-        _, raw = _first_rows(path, guess.spec())
-        _guess_clock(table, raw, guess)
-        _guess_lengths(table, raw, guess)
-        _guess_heading_and_speed(table, raw, guess)
-        _guess_texts(raw, guess)
+        if "t" not in guess.unclear:
+            _guess_time_form(table, guess)
+        meaning, lines = Meaning(), []
+        with contextlib.suppress(*([InputError] if guess.unclear else [])):
+            if not guess.unclear or guess.is_untimed:
+                meaning, lines = _guess_the_rest(path, table, guess)
+        if not lines:
+            _guess_what_is_stated(table, guess)
+            lines = _in_words(table, guess, ())
+        last = FILL_IN if guess.unclear else ""
+        draft = _toml_of(path, guess, meaning)
+        return Suggestion(toml=draft, lines=tuple(lines), last=last)
+
+
+def _guess_the_rest(
+    path: Path, table: Table, guess: _Guess
+) -> tuple[Meaning, list[str]]:
+    """What the first rows tell: the meaning of their headings, and all in words."""
+    _, raw = _first_rows(path, guess)
+    _guess_clock(table, raw, guess)
+    _guess_lengths(table, raw, guess)
+    _guess_heading_and_speed(table, raw, guess)
+    _guess_texts(raw, guess)
+    rows, meaning, columns = _understood(path, guess)
+    if any(note.endswith(MIRRORED) for note in meaning.notes):
+        _swap_axes(guess)
         rows, meaning, columns = _understood(path, guess)
-        lines = _in_words(table, guess, (*columns.notes, *meaning.notes))
-        lines += ["", "the first rows as understood:", *_shown(rows)]
-        return Suggestion(toml=_toml_of(path, guess, meaning), lines=tuple(lines))
+    lines = _in_words(table, guess, (*columns.notes, *meaning.notes))
+    if guess.is_untimed:
+        del rows["t"]
+    return meaning, [*lines, "", "the first rows as understood:", *_shown(rows)]
 
 
 def _guess_columns(table: Table) -> _Guess:
@@ -205,27 +238,42 @@ def _guess_columns(table: Table) -> _Guess:
     return dataclasses.replace(guess, columns=columns)
 
 
-def _first_rows(path: Path, spec: Mapping) -> tuple[Log, Rows]:
-    """A log, and rows of its first MiB as a source TOML takes them."""
-    log = opened(path, dict(spec))
+def _first_rows(path: Path, guess: _Guess) -> tuple[Log, Rows]:
+    """A log, and rows of its first MiB as its draft takes them.
+
+    Without a time those of a road user are `RATE_HZ` rows apart, in their order.
+    """
+    log = opened(path, guess.spec())
     for batch in batches(log.table, log.columns.fields, log.stats):
         if batch[LINE].size:
-            return log, as_texts(log.table, batch)
+            rows = as_texts(log.table, batch)
+            if guess.is_untimed:
+                order = np.argsort(rows["id"], kind="stable")
+                rows["t"][order] = np.arange(order.size) / RATE_HZ
+            return log, rows
     log.stats.check()
     raise InputError(f"{path}: rows: none: expected rows below the header")
 
 
 def _guess_time_form(table: Table, guess: _Guess) -> None:
     """Unit of times that are no seconds, milliseconds or frames: by the first cell."""
-    first = first_cell(table, guess.columns["t"])
-    if re.match(ISO_TIMES, first):
-        guess.units["t"] = ISO
-    elif pattern := date_pattern(known_cells(table, guess.columns["t"])):
-        guess.units["t"] = pattern
+    name = guess.columns["t"]
+    first, form = first_cell(table, name), ISO
+    if not re.match(ISO_TIMES, first):
+        form = date_pattern(known_cells(table, name))
+    stats = RowStats(table.path, allowed=0.5)
+    field = Field(name="t", column=name, form=form)
+    values = next(batches(table, [field], stats))["t"]
+    if 2 * values.size < stats.read:
+        guess.columns["t"] = UNCLEAR
+        cell = f"'{first[:40]}', no time in a form that is known: say units.t"
+        guess.comments["t"] = f"one of: {name}; its cells are such as {cell}"
+    elif form:
+        guess.units["t"] = form
     elif NUMBER.fullmatch(first) and abs(float(first)) > MAX_TIME:
         guess.units["t"] = "ns" if float(first) > 1e3 * MAX_TIME else "us"
     else:
-        _guess_clock_digits(table, guess)
+        _guess_clock_digits(table, values, guess)
     found = sampled(table, guess.columns["lat"]) if "lat" in guess.columns else None
     if found is not None and found.size and np.abs(found).min() > DEGREES["y"]:
         raise InputError(
@@ -235,12 +283,9 @@ def _guess_time_form(table: Table, guess: _Guess) -> None:
         )
 
 
-def _guess_clock_digits(table: Table, guess: _Guess) -> None:
-    """Tells by the rows of the first MiB if digits are times of day."""
-    name = guess.columns["t"]
-    field = Field(name="t", column=name)
-    values = next(batches(table, [field], RowStats(table.path, allowed=0.5)))["t"]
-    form, is_sure = clock_digits(known_cells(table, name), values)
+def _guess_clock_digits(table: Table, values: np.ndarray, guess: _Guess) -> None:
+    """Tells by the numbers [n] of the first MiB if digits are times of day."""
+    form, is_sure = clock_digits(known_cells(table, guess.columns["t"]), values)
     if is_sure:
         guess.units["t"] = form
         guess.said.append(f"units.t = {form}: seconds from 60 to 99 have no rows")
@@ -251,11 +296,18 @@ def _guess_clock_digits(table: Table, guess: _Guess) -> None:
         guess.open.append(f"units.t: {guess.units['t']}, or {form} of times of day?")
 
 
-def _guess_stated_units(table: Table, guess: _Guess) -> None:
-    """Units that names say, or the line below the header."""
+def _guess_what_is_stated(table: Table, guess: _Guess) -> None:
+    """Units that names say, or the line below the header; kinds of the first MiB."""
+    fields = [
+        Field(name=field, column=name, needed=False, text=True)
+        for field, name in guess.columns.items()
+        if field in TEXT and table.has(name)
+    ]
+    texts = batches(table, fields, RowStats(table.path, allowed=1.0))
+    _guess_texts(as_texts(table, next(texts, {})) if fields else {}, guess)
     for field in guess.columns.keys() & ALLOWED_UNITS.keys() - {*guess.unclear}:
         if unit := _said_unit(table, field, guess):
-            guess.units[field] = unit
+            guess.units.setdefault(field, unit)
 
 
 def _usual_rate(rate: float, fits: float) -> float | None:
@@ -266,6 +318,9 @@ def _usual_rate(rate: float, fits: float) -> float | None:
 
 def _guess_clock(table: Table, raw: Rows, guess: _Guess) -> None:
     """Unit of the time and rows per second, by the step of the road users' times."""
+    if guess.unclear:
+        guess.open.append(NO_RATE)
+        return
     ids = np.unique(raw["id"], return_inverse=True)[1]
     order = np.lexsort((raw["t"], ids))
     steps = np.diff(raw["t"][order])[np.diff(ids[order]) == 0]
@@ -304,18 +359,25 @@ def _said_unit(
 
 
 def _guess_lengths(table: Table, raw: Rows, guess: _Guess) -> None:
-    """Units of places and sizes: as their names say, else metres if cars fit them."""
+    """Units of places and sizes: as their names say, else metres if cars fit them.
+
+    Places without a unit are in feet where sizes without one are.
+    """
     if "lat" in guess.columns:
         guess.units.update({"lat": "deg", "lon": "deg"})
-    known = raw.get("length", np.zeros(0))
-    known = known[np.isfinite(known)]
-    is_long = bool(known.size) and float(np.median(known)) > LONG_CAR_M
-    lengths = ("x", "y", "length", "width")
-    for field in (name for name in lengths if name in guess.columns):
+    places = "m"
+    for field in (f for f in ("length", "width", "x", "y") if f in guess.columns):
         said = _said_unit(table, field, guess, ALLOWED_UNITS["length"])
-        guess.units[field] = said or ("ft" if is_long else "m")
-    if is_long:
-        guess.said.append(f"length: {np.median(known):.3g} in the median: feet")
+        guess.units[field] = said or places
+        if said or field not in LARGE_M:
+            continue
+        known = raw[field][np.isfinite(raw[field])]
+        middle = float(np.median(known)) if known.size else 0.0
+        fitting = (u for u in SIZE_UNITS if middle * UNITS[u] <= LARGE_M[field])
+        guess.units[field] = unit = next(fitting, "m")
+        places = "ft" if unit == "ft" else places
+        if unit != "m":
+            guess.said.append(f"units.{field} = {unit}: {middle:.3g} in the median")
     if "lat" in guess.columns or any(_said_unit(table, f, guess) for f in ("x", "y")):
         return
     span = max(np.ptp(raw["x"]), np.ptp(raw["y"]))
@@ -387,12 +449,26 @@ def _guess_texts(raw: Rows, guess: _Guess) -> None:
             del guess.columns["automated"]
 
 
+def _swap_axes(guess: _Guess) -> None:
+    """Exchanges x and y: the compass tells that x points north."""
+    for part in (guess.columns, guess.units):
+        part["x"], part["y"] = part["y"], part["x"]
+    heading = guess.columns["heading"]
+    for field, way in (("x", "east"), ("y", "north")):
+        why = f"swapped: {heading} turns as a compass does if this points {way}"
+        guess.comments[field] = why
+    guess.open.append(
+        f"x, y: swapped; if {heading} is no compass's, swap them back and say "
+        f'{CONVENTION} = "ccw_from_x"'
+    )
+
+
 def _understood(path: Path, guess: _Guess) -> tuple[Rows, Meaning, LogColumns]:
     """First rows in SI units, as an import takes them.
 
     Headings that contradict the positions are left out of the guess.
     """
-    log, rows = _first_rows(path, guess.spec())
+    log, rows = _first_rows(path, guess)
     rows = log.placed(rows)
     flags = np.unique(rows.get("automated", np.zeros(0, str))).tolist()
     try:
@@ -469,7 +545,7 @@ max_bad_rows = 0.01                    # share of rows that may be dropped
 {units}
 {scale}
 [defaults]
-rate_hz = {rate:g}
+rate_hz = {rate:g}{measured}
 length = 4.5                           # m, where nothing is known
 width = 1.8                            # m
 kind = "vehicle"
@@ -502,6 +578,9 @@ def _toml_of(path: Path, guess: _Guess, meaning: Meaning) -> str:
     form = meaning.form  # of headings; said where it is not as usual
     own = path.name.removeprefix(table_stem(path))
     ending = own if f"*{own}" in PATTERNS else path.name.removeprefix(path.stem)
+    units = {f: guess.units[f] for f in guess.columns if f in guess.units}
+    forms = f"one of {', '.join(CLOCKS)}, {PATTERN}"
+    unknown = f't = "{UNCLEAR}"{comment(forms)}' if "t" in guess.unclear else ""
     scale = "\n".join(f"{name} = {value!r}" for name, value in guess.scale.items())
     kinds = lines({text(name): kind for name, kind in guess.kinds.items()})
     return TOML.format(
@@ -511,8 +590,9 @@ def _toml_of(path: Path, guess: _Guess, meaning: Meaning) -> str:
         convention=f'{CONVENTION} = "{form.name}"\n' if form and form.note else "",
         table=f"{table}\n" if table else "",
         columns="\n".join(columns),
-        units=lines(guess.units),
+        units="\n".join(filter(None, (unknown, lines(units)))),
         scale=f"\n[scale]\n{scale}\n" if scale else "",
-        rate=guess.rate_hz or 10.0,
+        rate=guess.rate_hz or RATE_HZ,
+        measured="" if guess.rate_hz else comment(NOT_MEASURED),
         kinds=f"\n[kinds]\n{kinds}\n" if kinds else "",
     )
