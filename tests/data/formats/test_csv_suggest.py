@@ -387,7 +387,8 @@ NAMED = ("Czas", "id", "x", "y", "Azymut", "speed", "length", "type", "width")
 @pytest.mark.parametrize("drop", ["qf", ""])
 def test_a_time_that_nobody_reads(tmp_path, drop):
     """The draft has what does not depend on it; speeds tell the rate, if they can."""
-    path = strange(tmp_path, units=False, header=NAMED, drop=(drop,))
+    header = [*NAMED[:5], "speed_kmh", *NAMED[6:]]
+    path = strange(tmp_path, units=False, header=header, drop=(drop,))
     found = suggested(changed(path, _0=lambda cell: f"klatka {float(cell):.1f}"))
     toml = tomllib.loads(found.toml)
     reason = "t = \"?\"  # one of: Czas; its cells are such as 'klatka 0.0', no time in"
@@ -397,6 +398,8 @@ def test_a_time_that_nobody_reads(tmp_path, drop):
     assert toml["heading_convention"] == "cw_from_north"
     assert toml["kinds"] == {"car": "vehicle", "truck": "vehicle"}
     assert ("rate_hz = 10  # not measured" in found.toml) == bool(drop)
+    told = "recognised: rate_hz = 10: by the speeds, if they are in km/h"
+    assert (told in found.lines) != bool(drop)
     assert any(line.split()[:2] == ["id", "x"] for line in found.lines)
     assert found.last.startswith("fill in")
     source = tmp_path / "draft.toml"
@@ -445,7 +448,6 @@ def test_units_of_sizes_and_places(tmp_path, length, width, factor, units):
 def test_a_compass_tells_that_x_points_north(tmp_path, name):
     """Surveyors' X and Y are swapped; an import that does not says so."""
     right = strange(tmp_path, units=False, header=[*NAMED[:4], name, *NAMED[5:]])
-    right = changed(right)
     (as_is,) = taken(right)[2]
     header, rows = right.read_text().split("\n", 1)
     right.write_text(f"{header.replace('x;y', 'Y;X')}\n{rows}")

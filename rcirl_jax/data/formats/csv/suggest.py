@@ -403,7 +403,8 @@ def _guess_heading_and_speed(table: Table, raw: Rows, guess: _Guess) -> None:
         ratio = _speed_ratio(table.path, guess)
     if guess.rate_hz is None and ratio is not None:
         # the usual rate at which frames are apart as recorded speeds say, if one is
-        for unit, times in SPEED_RATIOS.items():
+        ratios = {guess.units[told[0]]: 1.0} if is_said else SPEED_RATIOS
+        for unit, times in ratios.items():
             if (near := _usual_rate(RATE_HZ * ratio / times, FRAMES_FIT)) is not None:
                 guess.rate_hz = near
                 guess.open.remove(NO_RATE)
