@@ -769,7 +769,7 @@ class Roads:
     @property
     def note(self) -> str:
         """Says what was found, in a line, and what to do where that is not enough."""
-        names = {lane.id.partition(".")[0] for lane in self.lanes}
+        names = {lane.id.rpartition(".")[0] for lane in self.lanes}
         apart = "" if np.isnan(self.width) else f", {self.width:.1f} m apart"
         given = "only numbers of lanes" if self.is_numbered else "no lanes"
         of = " and their numbers" if self.is_numbered else ""
