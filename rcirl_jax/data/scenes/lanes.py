@@ -201,7 +201,7 @@ class LaneGraph:
         lines = self.lines()
         pieces = [self.lanes[name] for name, number in lines.items() if number == line]
         beside = (x for lane in pieces for x in (lane.left, lane.right))
-        return frozenset(lines[x] for x in beside if x in lines) - {line}
+        return frozenset(lines[x] for x in beside if x and x in lines) - {line}
 
     def follows(self, before: Iterable[str], after: Iterable[str]) -> bool:
         """Returns whether one of the lanes leads into one of those after."""
