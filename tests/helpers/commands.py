@@ -145,7 +145,7 @@ def _ask(forking, word):
 
 
 def count_and_peak(script, path):
-    """What a script that reads `path` in a process of its own prints: two numbers.
+    """Return the two numbers that a script prints of `path`, in its own process.
 
     The scripts print what they counted and the most memory they held.
     """

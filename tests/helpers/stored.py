@@ -47,7 +47,7 @@ def assert_same_bits(one, other):
 
 
 def sweep_result() -> dict[str, object]:
-    """What a sweep of two leaky rates and two seeds says, with made-up numbers."""
+    """Return what a sweep of two leaky rates and two seeds says, made up."""
     estimate = {"value": 1.5, "low": 1.0, "high": 2.0, "seed_sd": 0.1}
     members, rows = {}, {}
     for rate in (0.01, 0.1):

@@ -114,10 +114,6 @@ CONVENTIONS = {
     "cw_from_x": (-1.0, 0.0),
     "ccw_from_north": (1.0, 0.5 * math.pi),
 }
-MIRRORED = (
-    "is a compass's by its name, but turns counter-clockwise: x and y are mirrored if "
-    "x points north and y east (swap them), or the name is wrong"
-)  # after the name of a column of headings
 CONVENTION = "heading_convention"  # the options of this file
 AUTOMATED = "automated_values"
 MOVING_MPS = 0.5  # m/s; the direction of a slower velocity is noise
@@ -551,6 +547,7 @@ class Meaning:
     form: HeadingForm | None = None  # None: no headings, or not to be believed
     flags: Mapping[str, bool] = dataclasses.field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    is_mirrored: bool = False  # a column named as a compass's shows that x points north
 
     def applied(self, values: Rows) -> Rows:
         """Returns rows with speed, and heading in radians counter-clockwise from +x."""
@@ -594,9 +591,14 @@ def meaning_of(
         says = [compass_axis(names[field]) for field in ("x", "y", "heading")]
         is_mirrored = form.turns_left and says == ["", "", "heading"]
         is_mirrored &= columns.middle is None
-        mirrored = f"heading: {names['heading']} {MIRRORED}" if is_mirrored else ""
-        notes = tuple(filter(None, (form.note, mirrored)))
-        return Meaning(form=form, flags=flags, notes=notes)
+        notes = (form.note,) if form.note else ()
+        if is_mirrored:
+            notes += (
+                f"heading: {names['heading']} is a compass's by its name, but turns "
+                "counter-clockwise: x and y are mirrored if x points north and y east "
+                "(swap them), or the name is wrong",
+            )
+        return Meaning(form=form, flags=flags, notes=notes, is_mirrored=is_mirrored)
     if {"vx", "vy"} <= names.keys():  # they are in the frame of x and y
         usual = {CONVENTION: "ccw_from_x"}
         try:

@@ -23,7 +23,6 @@ from rcirl_jax.data.formats.csv.columns import (
     DEGREES,
     HOLE,
     ISO_TIMES,
-    MIRRORED,
     NEEDED,
     NO,
     OF_PIXELS,
@@ -167,8 +166,10 @@ def suggested(path: Path) -> Suggestion:
         if "t" not in guess.unclear:
             _guess_time_form(table, guess)
         meaning, lines = Meaning(), []
-        with contextlib.suppress(*([InputError] if guess.unclear else [])):
-            if not guess.unclear or guess.is_untimed:
+        if not guess.unclear:
+            meaning, lines = _guess_the_rest(path, table, guess)
+        elif guess.is_untimed:
+            with contextlib.suppress(InputError):
                 meaning, lines = _guess_the_rest(path, table, guess)
         if not lines:
             _guess_what_is_stated(table, guess)
@@ -181,14 +182,14 @@ def suggested(path: Path) -> Suggestion:
 def _guess_the_rest(
     path: Path, table: Table, guess: _Guess
 ) -> tuple[Meaning, list[str]]:
-    """What the first rows tell: the meaning of their headings, and all in words."""
+    """Returns the meaning of headings by the first rows, and all they tell in words."""
     _, raw = _first_rows(path, guess)
     _guess_clock(table, raw, guess)
     _guess_lengths(table, raw, guess)
     _guess_heading_and_speed(table, raw, guess)
     _guess_texts(raw, guess)
     rows, meaning, columns = _understood(path, guess)
-    if any(note.endswith(MIRRORED) for note in meaning.notes):
+    if meaning.is_mirrored:
         _swap_axes(guess)
         rows, meaning, columns = _understood(path, guess)
     lines = _in_words(table, guess, (*columns.notes, *meaning.notes))
